@@ -1,0 +1,51 @@
+"""From plain config values to typed records: every key known, every type checked, one clear error."""
+
+from collections.abc import Mapping
+from typing import Any, TypeVar
+
+from omegaconf import OmegaConf
+from omegaconf.errors import OmegaConfBaseException
+
+from gns_pyg.errors import ConfigError
+
+Record = TypeVar("Record")
+
+
+def typed(record: type[Record], values: Any, where: str) -> Record:
+    """Turns a mapping (a Hydra config node or a plain dict) into the dataclass `record`.
+
+    Args:
+        record: a dataclass; its fields and their types are the schema.
+        values: mapping of keys to values; interpolations are resolved.
+        where: the config path that errors name, e.g. "scene".
+
+    Raises:
+        ConfigError: for an unknown or missing key or a value of the wrong type.
+    """
+    if not isinstance(values, Mapping) and not OmegaConf.is_dict(values):
+        raise ConfigError(where, repr(values), f"a mapping with the keys of {record.__name__}", "see conf/")
+    try:
+        merged = OmegaConf.merge(OmegaConf.structured(record), values)
+        return OmegaConf.to_object(merged)
+    except OmegaConfBaseException as error:
+        key = getattr(error, "full_key", None)
+        reason = str(error).splitlines()[0]
+        known = ", ".join(record.__dataclass_fields__)
+        raise ConfigError(
+            f"{where}.{key}" if key else where,
+            reason,
+            f"the keys of {where} are: {known}",
+            "correct the key or value; `python train.py --cfg job` prints the whole config",
+        ) from None
+
+
+def plain(config: Any) -> Any:
+    """Returns `config` (a Hydra node or a dataclass) as plain dicts, lists, strings and numbers."""
+    node = config if OmegaConf.is_config(config) else OmegaConf.structured(config)
+    return OmegaConf.to_container(node, resolve=True)
+
+
+def require(condition: bool, where: str, found: object, expected: str, remedy: str) -> None:
+    """Raises ConfigError unless `condition` holds."""
+    if not condition:
+        raise ConfigError(where, str(found), expected, remedy)

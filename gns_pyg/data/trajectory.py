@@ -1,0 +1,205 @@
+"""Reading and writing trajectories (H5MD files). Runs in Yade's Python too: numpy, h5py and errors only."""
+
+import hashlib
+import json
+import os
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+import h5py
+import numpy as np
+
+from gns_pyg.data.schema import FIXED_UNITS, GRAINS, H5MD_VERSION, RUN_KEYS, UNITS, violations
+from gns_pyg.errors import DataError
+
+CHUNK_FRAMES = 8
+
+
+class Trajectory:
+    """One case, read lazily: opening validates the file, frames are read when asked for.
+
+    Args:
+        path: an H5MD file written by `TrajectoryWriter`.
+
+    Attributes:
+        n_frames, n_grains: size.
+        times_s: (n_frames,) float64.
+        radius, mass: (n_grains,) float64, m and kg.
+        scene: the scene as resolved, a plain dict.
+        run: the run that made it: wall_clock_s, cores, steps, dt_s, creator, creator_version, case, ...
+
+    Raises:
+        DataError: if the file is missing, is not HDF5, is truncated, or breaks the layout (all violations at once).
+    """
+
+    def __init__(self, path: str | Path) -> None:
+        self.path = Path(path)
+        if not self.path.is_file():
+            raise DataError(
+                self.path, "no such file", "a trajectory file (.h5)", "generate it: python -m data_gen.generate"
+            )
+        try:
+            with h5py.File(self.path, "r") as file:
+                wrong = violations(file)
+                if not wrong:
+                    self._read_fixed(file)
+        except (OSError, RuntimeError, KeyError, ValueError) as error:
+            wrong = [f"cannot be read as HDF5 ({error})"]
+        if wrong:
+            raise DataError(
+                self.path,
+                "; ".join(wrong),
+                "a complete H5MD trajectory as docs/data_format.md lays it out",
+                "delete the file and generate it again, or correct what is listed",
+            )
+        self._file: h5py.File | None = None
+
+    def _read_fixed(self, file: h5py.File) -> None:
+        grains = file[GRAINS]
+        self.n_frames, self.n_grains = grains["position/value"].shape[:2]
+        self.times_s = grains["position/time"][:].astype(np.float64)
+        self.radius = grains["radius"][:].astype(np.float64)
+        self.mass = grains["mass"][:].astype(np.float64)
+        attributes = dict(file["parameters"].attrs)
+        self.scene: dict[str, Any] = json.loads(attributes.pop("scene"))
+        self.run = {key: value.item() if hasattr(value, "item") else value for key, value in attributes.items()}
+
+    def read(self, field: str, start: int = 0, stop: int | None = None) -> np.ndarray:
+        """Returns frames [start, stop) of `field` (position, velocity, angular_velocity), float64 (n, n_grains, 3)."""
+        if self._file is None:  # opened on first use, so that data-loader workers hold handles of their own
+            self._file = h5py.File(self.path, "r")
+        return self._file[GRAINS][field]["value"][start:stop].astype(np.float64)
+
+    @property
+    def frame_dt_s(self) -> float:
+        """Time between frames, s (the mean; 0 for a single frame)."""
+        return float((self.times_s[-1] - self.times_s[0]) / max(self.n_frames - 1, 1))
+
+    def content_hash(self) -> str:
+        """A hash of the positions: the same run has the same hash whatever its file is called."""
+        return hashlib.sha256(np.ascontiguousarray(self.read("position")).tobytes()).hexdigest()[:16]
+
+    def __getstate__(self) -> dict[str, Any]:
+        return {**self.__dict__, "_file": None}
+
+
+class TrajectoryWriter:
+    """Writes a trajectory frame by frame under a temporary name; `finish` gives it its final name.
+
+    Used as a context manager: leaving it without `finish` removes the temporary file.
+
+    Args:
+        path: final name of the file.
+        scene: the scene as resolved (plain dict).
+        radius, mass: (n_grains,), m and kg.
+        boundary: part name -> {"vertices": (n, 3) m, "triangles": (m, 3), "motion": dict}.
+        decimals: digits kept after the point, per field (HDF5's scale-offset filter), SI units.
+    """
+
+    def __init__(
+        self,
+        path: str | Path,
+        scene: Mapping[str, Any],
+        radius: np.ndarray,
+        mass: np.ndarray,
+        boundary: Mapping[str, Mapping[str, Any]],
+        decimals: Mapping[str, int],
+    ) -> None:
+        self.path = Path(path)
+        self.path.parent.mkdir(parents=True, exist_ok=True)
+        self._temporary = self.path.with_name(f".{self.path.name}.{os.getpid()}.part")
+        self._file = h5py.File(self._temporary, "w")
+        self._n_frames, self._n_grains = 0, len(radius)
+        header = self._file.create_group("h5md")
+        header.attrs["version"] = H5MD_VERSION
+        header.create_group("author").attrs["name"] = "gns_pyg"
+        grains = self._file.create_group(GRAINS)
+        box = grains.create_group("box")
+        box.attrs["dimension"] = 3
+        box.attrs["boundary"] = ["none"] * 3
+        for name, values in (("radius", radius), ("mass", mass)):
+            grains.create_dataset(name, data=np.asarray(values, np.float64)).attrs["unit"] = FIXED_UNITS[name]
+        grains.create_dataset("species", data=np.zeros(len(radius), np.int32))
+        for name, unit in UNITS.items():
+            self._create_field(grains.create_group(name), unit, decimals[name])
+        for name in list(UNITS)[1:]:  # H5MD: elements sampled together share step and time
+            for shared in ("step", "time"):
+                grains[name][shared] = grains["position"][shared]
+        for name, part in boundary.items():
+            group = self._file.create_group(f"boundary/{name}")
+            group.create_dataset("vertices", data=np.asarray(part["vertices"], np.float64)).attrs["unit"] = "m"
+            group.create_dataset("triangles", data=np.asarray(part["triangles"], np.int32))
+            group.attrs["motion"] = json.dumps(part["motion"])
+        self._file.create_group("parameters").attrs["scene"] = json.dumps(scene)
+
+    def _create_field(self, group: h5py.Group, unit: str, decimals: int) -> None:
+        if group.name.endswith("position"):
+            group.create_dataset("step", (0,), np.int64, maxshape=(None,))
+            group.create_dataset("time", (0,), np.float64, maxshape=(None,)).attrs["unit"] = "s"
+        value = group.create_dataset(
+            "value",
+            (0, self._n_grains, 3),
+            np.float64,
+            maxshape=(None, self._n_grains, 3),
+            chunks=(CHUNK_FRAMES, self._n_grains, 3),
+            scaleoffset=decimals,
+            shuffle=True,
+            compression="gzip",
+            compression_opts=6,
+        )
+        value.attrs["unit"] = unit
+        self._pending: dict[str, list[np.ndarray]] = {name: [] for name in UNITS}
+
+    def append(self, step: int, time_s: float, pos: np.ndarray, vel: np.ndarray, ang_vel: np.ndarray) -> None:
+        """Adds a frame: grain centres (n_grains, 3) m, velocities m/s, angular velocities rad/s.
+
+        Raises:
+            DataError: if a value is not finite; nothing of this frame is written.
+        """
+        frame = dict(zip(UNITS, (pos, vel, ang_vel), strict=True))
+        for name, values in frame.items():
+            if not np.isfinite(values).all():
+                grain = int(np.argwhere(~np.isfinite(values).all(axis=1))[0, 0])
+                raise DataError(
+                    self.path,
+                    f"{name} of grain {grain} is not finite at step {step}",
+                    "finite values",
+                    "lower the time step",
+                )
+            self._pending[name].append(np.array(values, np.float64))
+        grains = self._file[GRAINS]
+        for name, value in (("step", step), ("time", time_s)):
+            grains["position"][name].resize((self._n_frames + 1,))
+            grains["position"][name][self._n_frames] = value
+        self._n_frames += 1
+        if len(self._pending["position"]) == CHUNK_FRAMES:  # a whole chunk at once: each is compressed once
+            self._flush()
+
+    def _flush(self) -> None:
+        for name, frames in self._pending.items():
+            if frames:
+                value = self._file[GRAINS][name]["value"]
+                value.resize(self._n_frames, axis=0)
+                value[self._n_frames - len(frames) :] = np.stack(frames)
+                frames.clear()
+
+    def finish(self, run: Mapping[str, Any]) -> None:
+        """Completes the file with the facts of the run (all of schema.RUN_KEYS) and gives it its final name."""
+        missing = [key for key in RUN_KEYS if key not in run]
+        if missing:
+            raise DataError(self.path, f"run facts without {missing}", f"all of {RUN_KEYS}", "pass them to finish()")
+        self._flush()
+        self._file["parameters"].attrs.update(run)
+        creator = self._file["h5md"].create_group("creator")
+        creator.attrs["name"], creator.attrs["version"] = run["creator"], run["creator_version"]
+        self._file.close()
+        os.replace(self._temporary, self.path)
+
+    def __enter__(self) -> "TrajectoryWriter":
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        if self._file:
+            self._file.close()
+        self._temporary.unlink(missing_ok=True)

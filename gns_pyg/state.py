@@ -1,0 +1,116 @@
+"""The records that every room passes on. Shapes and units are said here, once.
+
+Conventions: SI units. Edges: `edges[0]` sends, `edges[1]` receives; `rel_pos = pos[sender] - pos[receiver]`.
+Several graphs are batched by concatenating their grains; `batch` says which graph a grain belongs to.
+"""
+
+from dataclasses import dataclass, fields, replace
+from typing import Self
+
+import torch
+from jaxtyping import Float, Int
+from torch import Tensor
+
+
+class Record:
+    """A frozen dataclass of tensors that can move between devices."""
+
+    def to(self, device: torch.device | str, non_blocking: bool = False) -> Self:
+        """Returns a copy with every tensor on `device`; dtypes stay."""
+        moved = {
+            f.name: value.to(device, non_blocking=non_blocking)
+            for f in fields(self)  # type: ignore[arg-type]
+            if isinstance(value := getattr(self, f.name), Tensor)
+        }
+        return replace(self, **moved)  # type: ignore[type-var]
+
+
+@dataclass(frozen=True)
+class State(Record):
+    """Grains of one or more graphs at one instant.
+
+    Attributes:
+        pos: grain centres, m, float64.
+        vel: grain velocity, m/s, float64. Instantaneous, or the backward difference (pos(t) - pos(t - dt)) / dt
+            where the model's state is `differences`.
+        ang_vel: angular velocity, rad/s, float64, or None where the model's state does not hold it.
+        radius: grain radius, m, float64.
+        time_s: time of each graph, s; walls move with it.
+        batch: graph of each grain, sorted.
+    """
+
+    pos: Float[Tensor, "n_grains 3"]
+    vel: Float[Tensor, "n_grains 3"]
+    ang_vel: Float[Tensor, "n_grains 3"] | None
+    radius: Float[Tensor, " n_grains"]
+    time_s: Float[Tensor, " n_graphs"]
+    batch: Int[Tensor, " n_grains"]
+
+    @property
+    def n_graphs(self) -> int:
+        return self.time_s.shape[0]
+
+
+@dataclass(frozen=True)
+class Window(Record):
+    """Consecutive raw frames of one or more cases; what the data set yields and a batch holds.
+
+    Attributes:
+        pos: grain centres, m, float64.
+        vel: instantaneous velocity, m/s, float64.
+        ang_vel: angular velocity, rad/s, float64.
+        radius: grain radius, m, float64.
+        time_s: time of frame 0 of each graph, s.
+        batch: graph of each grain, sorted.
+        frame_dt_s: time between frames, s.
+    """
+
+    pos: Float[Tensor, "n_frames n_grains 3"]
+    vel: Float[Tensor, "n_frames n_grains 3"]
+    ang_vel: Float[Tensor, "n_frames n_grains 3"]
+    radius: Float[Tensor, " n_grains"]
+    time_s: Float[Tensor, " n_graphs"]
+    batch: Int[Tensor, " n_grains"]
+    frame_dt_s: float
+
+    @staticmethod
+    def collate(windows: "list[Window]") -> "Window":
+        """Joins single-graph windows of equal length into one batch."""
+        sizes = torch.tensor([w.radius.shape[0] for w in windows])
+        return Window(
+            pos=torch.cat([w.pos for w in windows], 1),
+            vel=torch.cat([w.vel for w in windows], 1),
+            ang_vel=torch.cat([w.ang_vel for w in windows], 1),
+            radius=torch.cat([w.radius for w in windows]),
+            time_s=torch.cat([w.time_s for w in windows]),
+            batch=torch.repeat_interleave(torch.arange(len(windows)), sizes),
+            frame_dt_s=windows[0].frame_dt_s,
+        )
+
+
+@dataclass(frozen=True)
+class Walls(Record):
+    """Boundary points of every graph at its time, world frame; graph g owns rows [g * n, (g + 1) * n).
+
+    Attributes:
+        pos: boundary points, m, float64.
+        normal: unit normals that point to the grains' side.
+        vel: velocity of the wall at the point, m/s.
+    """
+
+    pos: Float[Tensor, "n_points 3"]
+    normal: Float[Tensor, "n_points 3"]
+    vel: Float[Tensor, "n_points 3"]
+
+
+@dataclass(frozen=True)
+class Graph(Record):
+    """Who can touch whom within the cutoff.
+
+    Attributes:
+        grain_edges: [sender grain, receiver grain]; both directions of every pair.
+        wall_edges: [boundary point (row of Walls), receiver grain]; walls only send.
+    """
+
+    grain_edges: Int[Tensor, "2 n_grain_edges"]
+    wall_edges: Int[Tensor, "2 n_wall_edges"]
