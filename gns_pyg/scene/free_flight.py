@@ -1,0 +1,37 @@
+"""The law a grain follows when it touches nothing: gravity with the DEM's own damping."""
+
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+from gns_pyg.scene.scene import Scene
+
+
+def free_flight(
+    pos: Float[Tensor, "n 3"], vel: Float[Tensor, "n 3"], scene: Scene, dt_s: float
+) -> tuple[Float[Tensor, "n 3"], Float[Tensor, "n 3"]]:
+    """Moves free grains by `dt_s`, exactly.
+
+    Cundall's damping acts on each component of the resultant force (Yade's NewtonIntegrator): with gravity included a
+    component g is felt as g (1 - damping) while it speeds the grain up and g (1 + damping) while it slows it
+    down. The turning point, where one becomes the other, may lie inside the step.
+
+    Args:
+        pos: grain centres, m.
+        vel: instantaneous velocity, m/s.
+        scene: gives gravity and damping.
+        dt_s: time to move, s.
+
+    Returns:
+        Position and velocity after `dt_s`.
+    """
+    gravity = torch.tensor(scene.gravity_m_s2, dtype=pos.dtype, device=pos.device)
+    damping = scene.damping if scene.damping_on_gravity else 0.0
+    slowing, speeding = gravity * (1 + damping), gravity * (1 - damping)
+    against = vel * gravity < 0
+    until_turn = torch.where(against, -vel / torch.where(slowing == 0, 1.0, slowing), 0.0).clamp(max=dt_s)
+    rest = dt_s - until_turn
+    turn_vel = vel + slowing * until_turn
+    turn_pos = pos + (vel + turn_vel) / 2 * until_turn
+    end_vel = turn_vel + speeding * rest
+    return turn_pos + (turn_vel + end_vel) / 2 * rest, end_vel
