@@ -1,0 +1,119 @@
+"""What costs nothing to predict: trivial one-step predictors, and the climatology of the training cases.
+
+A network that does not beat these has learned nothing; every error is reported beside them.
+"""
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+import torch
+
+from gns_pyg.data.trajectory import Trajectory
+from gns_pyg.evaluation.errors import position_error
+from gns_pyg.evaluation.observables import angle_of_repose, center_of_mass, from_frame
+from gns_pyg.scene.free_flight import free_flight
+from gns_pyg.scene.scene import Scene
+
+FIRST_FRAME = 2  # the first frame that all trivial predictors can predict: some need the two frames before it
+
+
+def trivial_errors(trajectory: Trajectory, scene: Scene) -> dict[str, np.ndarray]:
+    """Mean one-step position error of every trivial predictor along a run.
+
+    With x the position, v the instantaneous velocity and d = x(t) - x(t - dt) the last displacement:
+
+    - `frozen`: x stays.
+    - `last displacement repeated`: x + d.
+    - `last displacement + free-flight acceleration`: x + d + a dt^2.
+    - `instantaneous velocity, free flight`: x + v dt + a dt^2 / 2.
+
+    The acceleration a is the scene's own free-flight law, gravity with the DEM's damping.
+
+    Returns:
+        predictor name -> (n_frames - 2,), m: errors of frames 2, 3, ..., n_frames - 1.
+    """
+    pos, vel, dt_s = trajectory.read("position"), trajectory.read("velocity"), trajectory.frame_dt_s
+    now, truth = pos[1:-1], pos[FIRST_FRAME:]
+    last = now - pos[:-2]
+    by_difference = _fly(now, last / dt_s, scene, dt_s)
+    predicted = {
+        "frozen": now,
+        "last displacement repeated": now + last,
+        "last displacement + free-flight acceleration": now + last + 2 * (by_difference - now - last),
+        "instantaneous velocity, free flight": _fly(now, vel[1:-1], scene, dt_s),
+    }
+    return {name: position_error(guess, truth) for name, guess in predicted.items()}
+
+
+def best_trivial(cases: Sequence[Mapping[str, np.ndarray]]) -> tuple[str, float]:
+    """The trivial predictor with the smallest error: mean over frames, then over cases.
+
+    Args:
+        cases: per case predictor name -> (n,) m.
+
+    Returns:
+        (name, mean error, m).
+    """
+    means = {name: float(np.mean([case[name].mean() for case in cases])) for name in cases[0]}
+    best = min(means, key=lambda name: means[name])
+    return best, means[best]
+
+
+def _fly(pos: np.ndarray, vel: np.ndarray, scene: Scene, dt_s: float) -> np.ndarray:
+    """Positions after `dt_s` of free flight; pos and vel (n_frames, n_grains, 3)."""
+    flat_pos, flat_vel = (torch.from_numpy(np.ascontiguousarray(x.reshape(-1, 3))) for x in (pos, vel))
+    return free_flight(flat_pos, flat_vel, scene, dt_s)[0].numpy().reshape(pos.shape)
+
+
+@dataclass(frozen=True)
+class Climatology:
+    """Mean curves of the training cases: the forecast of someone who has seen the scene but not this case.
+
+    Attributes:
+        times_s: (n_frames,), s.
+        center_of_mass_m: (n_frames, 3), m.
+        angle_of_repose_deg: (n_frames,), degrees; None where the scene defines no angle of repose.
+    """
+
+    times_s: np.ndarray
+    center_of_mass_m: np.ndarray
+    angle_of_repose_deg: np.ndarray | None
+
+    def center_of_mass_at(self, times_s: np.ndarray) -> np.ndarray:
+        """The mean curve at `times_s` (n,), (n, 3), m; linear between frames, held beyond the last."""
+        return _at(times_s, self.times_s, self.center_of_mass_m)
+
+    def center_of_mass_error_m(self, times_s: np.ndarray, truth: np.ndarray) -> float:
+        """Largest distance (3D, over frames) between the mean curve and a case's centre of mass `truth` (n, 3), m."""
+        return float(np.linalg.norm(self.center_of_mass_at(times_s) - truth, axis=1).max())
+
+    def mean_angle_of_repose_deg(self, scene: Scene) -> float:
+        """The mean angle of repose of the training cases over the frames from `from_s` on; nan if none is defined."""
+        if self.angle_of_repose_deg is None:
+            return float("nan")
+        return nanmean(self.angle_of_repose_deg[from_frame(self.times_s, scene) :])
+
+
+def climatology(trajectories: Sequence[Trajectory], scene: Scene) -> Climatology:
+    """Averages the training cases' curves, aligned by time (linear between frames) on the first case's frames."""
+    times_s = trajectories[0].times_s
+    centers, angles = [], []
+    for trajectory in trajectories:
+        pos = trajectory.read("position")
+        centers.append(_at(times_s, trajectory.times_s, center_of_mass(pos, trajectory.mass)))
+        if scene.angle_of_repose is not None:
+            angles.append(_at(times_s, trajectory.times_s, angle_of_repose(pos, scene)[:, None])[:, 0])
+    mean_angle = np.array([nanmean(frame) for frame in np.array(angles).T]) if angles else None
+    return Climatology(times_s, np.mean(centers, axis=0), mean_angle)
+
+
+def nanmean(values: np.ndarray) -> float:
+    """Mean of the finite values; nan (without a warning) where there are none."""
+    finite = values[np.isfinite(values)]
+    return float(finite.mean()) if len(finite) else float("nan")
+
+
+def _at(times_s: np.ndarray, known_s: np.ndarray, curve: np.ndarray) -> np.ndarray:
+    """`curve` (n_known, k) at `times_s` (n,): (n, k)."""
+    return np.stack([np.interp(times_s, known_s, column) for column in curve.T], axis=1)

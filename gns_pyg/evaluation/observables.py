@@ -1,0 +1,295 @@
+"""What an engineer reads from a granular run: functions of positions alone, so that DEM and network are read alike.
+
+Positions `pos` are grain centres, m, (n_frames, n_grains, 3) float64; times `times_s` are (n_frames,) s.
+"""
+
+import numpy as np
+import torch
+from scipy.sparse import coo_matrix
+from scipy.sparse.csgraph import connected_components
+from scipy.spatial import cKDTree
+from trimesh import Trimesh
+
+from gns_pyg.errors import ConfigError
+from gns_pyg.scene.mesh import build_mesh, distance, inside
+from gns_pyg.scene.motion import to_body
+from gns_pyg.scene.scene import Scene
+
+BIN_DIAMETERS = 2.0  # width of a surface bin
+BED_GAP_DIAMETERS = 1.25  # grains nearer than this belong together: the paper's cutoff, 2.5 radii
+CENTRAL_SHARE = 0.6  # of the bed's width across the drum; the surface bends towards the wall beyond it
+
+
+def center_of_mass(pos: np.ndarray, mass: np.ndarray) -> np.ndarray:
+    """Centre of mass of all grains (escaped ones too), per frame.
+
+    Args:
+        pos: m, (n_frames, n_grains, 3).
+        mass: kg, (n_grains,).
+
+    Returns:
+        (n_frames, 3), m.
+    """
+    return np.einsum("fgi,g->fi", pos, mass) / mass.sum()
+
+
+def up_direction(scene: Scene) -> np.ndarray:
+    """Unit vector against gravity, (3,); +z where there is no gravity."""
+    gravity = np.asarray(scene.gravity_m_s2, np.float64)
+    strength = np.linalg.norm(gravity)
+    return -gravity / strength if strength > 0 else np.array([0.0, 0.0, 1.0])
+
+
+# ---------------------------------------------------------------------------------------------- angle of repose
+
+
+def angle_of_repose(pos: np.ndarray, scene: Scene) -> np.ndarray:
+    """Angle of the bed's free surface against the horizontal, per frame.
+
+    Only grains of the bed count: the largest cluster of grains nearer than 1.25 diameters to each other, so that a
+    grain in flight or an escaped one does not pose as surface. The coordinate along the surface is divided into bins
+    of about two grain diameters (at least four bins), the highest grain of each bin is the surface (the radius that
+    lies between its centre and its top is the same everywhere and leaves the slope as it is), and a least-squares
+    line through these grains gives the angle.
+
+    `plane` (a drum): the coordinate is the horizontal one across the axis; the middle half of the bed's grains along
+    the axis and the central 60 % of the bed's width are read (away from end caps and mantle); the angle is unsigned.
+    `radial` (a heap): the coordinate is the distance from the vertical axis through the middle of the boundary; the
+    angle is positive where the heap is highest in the middle, negative for a crater.
+
+    Args:
+        pos: m, (n_frames, n_grains, 3).
+        scene: gives `angle_of_repose`, gravity and the grain radius.
+
+    Returns:
+        (n_frames,), degrees; nan where fewer than three bins hold a grain.
+
+    Raises:
+        ConfigError: if the scene defines no angle of repose, of an unknown kind, or an axis along gravity.
+    """
+    definition = scene.angle_of_repose
+    if definition is None:
+        raise ConfigError(
+            "scene.angle_of_repose", "not defined", "a kind (plane or radial) and from_s", "define it in the scene"
+        )
+    radius, up = scene.grains.radius_m, up_direction(scene)
+    if definition.kind == "plane":
+        axis = np.asarray(definition.axis, np.float64)
+        across = np.cross(up, axis)
+        if not np.linalg.norm(across) > 1e-6 * np.linalg.norm(axis):
+            raise ConfigError(
+                "scene.angle_of_repose.axis", str(definition.axis), "an axis that is not along gravity", "turn the axis"
+            )
+        across, axis = across / np.linalg.norm(across), axis / np.linalg.norm(axis)
+        return np.array([_plane_angle(_bed(frame, radius), axis, across, up, radius) for frame in pos])
+    if definition.kind == "radial":
+        middle = _boundary_middle(scene)
+        return np.array([_radial_angle(_bed(frame, radius), middle, up, radius) for frame in pos])
+    raise ConfigError("scene.angle_of_repose.kind", definition.kind, "plane or radial", "pick one of them")
+
+
+def mean_angle_of_repose(pos: np.ndarray, times_s: np.ndarray, scene: Scene) -> tuple[float, float]:
+    """Angle of repose averaged over the frames from `scene.angle_of_repose.from_s` on.
+
+    Returns:
+        (mean, standard error), degrees; the error allows for correlation in time, see `time_mean`.
+    """
+    steady = pos[from_frame(times_s, scene) :]
+    return time_mean(angle_of_repose(steady, scene))
+
+
+def from_frame(times_s: np.ndarray, scene: Scene) -> int:
+    """Index of the first frame that the angle of repose is averaged over (n_frames if the run ends before)."""
+    start = 0.0 if scene.angle_of_repose is None else scene.angle_of_repose.from_s
+    return int(np.searchsorted(times_s, start - 1e-9))
+
+
+def time_mean(values: np.ndarray) -> tuple[float, float]:
+    """Mean of a correlated series and its standard error by block averaging (Flyvbjerg and Petersen 1989).
+
+    The standard error of block means grows with the block length until blocks are independent; the largest value
+    over block lengths 1, 2, 4, ... with at least four blocks is taken. Frames that are nan are left out.
+
+    Args:
+        values: (n,).
+
+    Returns:
+        (mean, standard error); nan where there are no values, or fewer than two for the error.
+    """
+    values = values[np.isfinite(values)]
+    if len(values) == 0:
+        return float("nan"), float("nan")
+    errors, length = [], 1
+    while len(values) // length >= (4 if length > 1 else 2):
+        n_blocks = len(values) // length
+        blocks = values[: n_blocks * length].reshape(n_blocks, length).mean(axis=1)
+        errors.append(blocks.std(ddof=1) / np.sqrt(n_blocks))
+        length *= 2
+    return float(values.mean()), float(max(errors, default=float("nan")))
+
+
+def _bed(pos: np.ndarray, radius: float) -> np.ndarray:
+    """Grains (n, 3) of the largest cluster of one frame (n_grains, 3)."""
+    pairs = cKDTree(pos).query_pairs(BED_GAP_DIAMETERS * 2 * radius, output_type="ndarray")
+    links = coo_matrix((np.ones(len(pairs), np.int8), (pairs[:, 0], pairs[:, 1])), shape=(len(pos), len(pos)))
+    label = connected_components(links, directed=False)[1]
+    return pos[label == np.bincount(label).argmax()]
+
+
+def _plane_angle(bed: np.ndarray, axis: np.ndarray, across: np.ndarray, up: np.ndarray, radius: float) -> float:
+    along = bed @ axis
+    low, high = np.quantile(along, [0.25, 0.75])
+    slab = bed[(along >= low) & (along <= high)]
+    coordinate = slab @ across
+    edge, width = coordinate.min(), np.ptp(coordinate)
+    margin = 0.5 * (1 - CENTRAL_SHARE) * width
+    slope = _surface_slope(coordinate, slab @ up, edge + margin, edge + width - margin, radius)
+    return float(np.degrees(np.arctan(abs(slope))))
+
+
+def _radial_angle(bed: np.ndarray, middle: np.ndarray, up: np.ndarray, radius: float) -> float:
+    height = (bed - middle) @ up
+    distance = np.linalg.norm(bed - middle - height[:, None] * up, axis=1)
+    slope = _surface_slope(distance, height, 0.0, distance.max(), radius)
+    return float(np.degrees(np.arctan(-slope)))
+
+
+def _surface_slope(coordinate: np.ndarray, height: np.ndarray, low: float, high: float, radius: float) -> float:
+    """Slope of the line through the highest grain of each bin between `low` and `high`; nan below three bins."""
+    n_bins = max(4, round((high - low) / (BIN_DIAMETERS * 2 * radius)))
+    edges = np.linspace(low, high, n_bins + 1)
+    bin_of = np.searchsorted(edges, coordinate, side="right") - 1
+    bin_of[coordinate == high] = n_bins - 1
+    tops = []
+    for index in range(n_bins):
+        members = np.flatnonzero(bin_of == index)
+        if len(members):
+            tops.append(members[height[members].argmax()])
+    if len(tops) < 3 or np.ptp(coordinate[tops]) == 0:
+        return float("nan")
+    return float(np.polyfit(coordinate[tops], height[tops], 1)[0])
+
+
+def _boundary_middle(scene: Scene) -> np.ndarray:
+    """Middle of the box around all boundary parts, (3,), m; the origin where there is no boundary."""
+    if not scene.boundary:
+        return np.zeros(3)
+    corners = np.concatenate([build_mesh(name, part).bounds for name, part in scene.boundary.items()])
+    return 0.5 * (corners.min(axis=0) + corners.max(axis=0))
+
+
+# ------------------------------------------------------------------------------------------ contacts and walls
+
+
+def mean_overlap_ratio(pos: np.ndarray, radius: np.ndarray) -> np.ndarray:
+    """Mean overlap of touching grain pairs as a part of their mean diameter, per frame; walls are not counted.
+
+    A pair touches where d < r_i + r_j; its overlap is (r_i + r_j - d) / (r_i + r_j).
+
+    Args:
+        pos: m, (n_frames, n_grains, 3).
+        radius: m, (n_grains,).
+
+    Returns:
+        (n_frames,), dimensionless (0.01 is one per cent of a diameter); 0 where no pair touches.
+    """
+    ratio = np.zeros(len(pos))
+    for index, frame in enumerate(pos):
+        pairs = cKDTree(frame).query_pairs(2 * radius.max(), output_type="ndarray")
+        reach = radius[pairs[:, 0]] + radius[pairs[:, 1]]
+        overlap = reach - np.linalg.norm(frame[pairs[:, 0]] - frame[pairs[:, 1]], axis=1)
+        touching = overlap > 0
+        if touching.any():
+            ratio[index] = (overlap[touching] / reach[touching]).mean()
+    return ratio
+
+
+def escaped_grains(pos: np.ndarray, times_s: np.ndarray, scene: Scene) -> np.ndarray:
+    """Number of grains whose centre lies outside every closed part of the boundary, per frame.
+
+    Positions are carried into each part's body frame, where its mesh is at rest. Scenes without a closed part have
+    no outside: zeros.
+
+    Args:
+        pos: m, (n_frames, n_grains, 3).
+        times_s: (n_frames,), s; walls move with it.
+
+    Returns:
+        (n_frames,), int.
+    """
+    out = np.ones(pos.shape[:2], bool)
+    closed = 0
+    for name, part in scene.boundary.items():
+        mesh = build_mesh(name, part)
+        if not mesh.is_watertight:
+            continue
+        closed += 1
+        interior = _Interior(mesh, 2 * scene.grains.radius_m)
+        for index, (frame, time_s) in enumerate(zip(pos, times_s, strict=True)):
+            points, times = torch.from_numpy(np.ascontiguousarray(frame)), torch.full((len(frame),), float(time_s), dtype=torch.float64)
+            out[index] &= ~interior(to_body(part.motion, points, times).numpy())
+    return out.sum(axis=1) if closed else np.zeros(len(pos), int)
+
+
+class _Interior:
+    """`inside(mesh, pos)`, the exact test spared for points in grid cells that the surface does not come near.
+
+    Args:
+        mesh: closed.
+        cell_m: edge of the grid's cells, m.
+    """
+
+    def __init__(self, mesh: Trimesh, cell_m: float) -> None:
+        self.mesh, self.cell_m, self.corner = mesh, cell_m, mesh.bounds[0]
+        self.shape = np.ceil(mesh.extents / cell_m).astype(int)
+        center = self.corner + (np.indices(self.shape).reshape(3, -1).T + 0.5) * cell_m
+        safe = inside(mesh, center)
+        safe[safe] = distance(mesh, center[safe]) > cell_m * np.sqrt(3) / 2
+        self.safe = safe.reshape(self.shape)
+
+    def __call__(self, pos: np.ndarray) -> np.ndarray:
+        """bool (n,) for pos (n, 3), m, in the mesh's frame."""
+        cell = np.floor((pos - self.corner) / self.cell_m)
+        result = ((cell >= 0) & (cell < self.shape)).all(axis=1)
+        result[result] = self.safe[tuple(cell[result].astype(int).T)]
+        result[~result] = inside(self.mesh, pos[~result])
+        return result
+
+
+# -------------------------------------------------------------------------------------------------- velocities
+
+
+def finite_difference_velocity(pos: np.ndarray, times_s: np.ndarray) -> np.ndarray:
+    """Displacement to the next frame over the time between, m/s, (n_frames - 1, n_grains, 3)."""
+    return np.diff(pos, axis=0) / np.diff(times_s)[:, None, None]
+
+
+def mean_speed(pos: np.ndarray, times_s: np.ndarray) -> np.ndarray:
+    """Mean over grains of the finite-difference speed, m/s, (n_frames - 1,): DEM and network read alike, unlike the
+    DEM's instantaneous velocity, which a difference over one frame smooths."""
+    return np.linalg.norm(finite_difference_velocity(pos, times_s), axis=2).mean(axis=1)
+
+
+def granular_temperature(pos: np.ndarray, times_s: np.ndarray, radius: np.ndarray) -> np.ndarray:
+    """One third of the mean squared velocity fluctuation, <|v - v_local|^2> / 3, per frame.
+
+    v is the finite-difference velocity and v_local its mean over the grain itself and all grains whose centre lies
+    within three (largest) radii of its own; a grain alone contributes 0.
+
+    Args:
+        pos: m, (n_frames, n_grains, 3).
+        radius: m, (n_grains,).
+
+    Returns:
+        (n_frames - 1,), m^2/s^2.
+    """
+    velocity = finite_difference_velocity(pos, times_s)
+    temperature = np.empty(len(velocity))
+    for index, (frame, vel) in enumerate(zip(pos[:-1], velocity, strict=True)):
+        pairs = cKDTree(frame).query_pairs(3 * radius.max(), output_type="ndarray")
+        total, count = vel.copy(), np.ones(len(frame))
+        for this, other in (pairs.T, pairs.T[::-1]):
+            np.add.at(total, this, vel[other])
+            count += np.bincount(this, minlength=len(frame))
+        temperature[index] = ((vel - total / count[:, None]) ** 2).sum(axis=1).mean() / 3
+    return temperature
