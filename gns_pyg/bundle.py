@@ -1,0 +1,100 @@
+"""A trained simulator as one folder: weights.safetensors and bundle.json. Data only, nothing executable."""
+
+import json
+import os
+import shutil
+from collections.abc import Mapping
+from dataclasses import asdict
+from pathlib import Path
+from typing import Any
+
+from safetensors import SafetensorError
+from safetensors.torch import load_file, save_file
+
+from gns_pyg.config import typed
+from gns_pyg.dynamics.model_config import ModelConfig
+from gns_pyg.dynamics.simulator import Simulator
+from gns_pyg.errors import BundleError
+from gns_pyg.models.statistics import Statistics
+from gns_pyg.scene.boundary_points import BoundaryPoints
+from gns_pyg.scene.scene import Scene
+
+FORMAT_VERSION = 1
+
+
+def save(folder: str | Path, simulator: Simulator, card: Mapping[str, Any]) -> Path:
+    """Writes a bundle under a temporary name, then gives it its final name; an old bundle there is replaced.
+
+    Args:
+        folder: where the bundle goes.
+        simulator: the trained simulator.
+        card: what it was trained on and how good it is (plain values).
+    """
+    folder = Path(folder)
+    temporary = folder.with_name(f".{folder.name}.{os.getpid()}.part")
+    shutil.rmtree(temporary, ignore_errors=True)
+    temporary.mkdir(parents=True)
+    weights = {key: value.detach().cpu().contiguous() for key, value in simulator.state_dict().items()}
+    save_file(weights, temporary / "weights.safetensors")
+    description = {
+        "format_version": FORMAT_VERSION,
+        "scene": asdict(simulator.scene),
+        "model": asdict(simulator.config),
+        "statistics": asdict(simulator.statistics),
+        "card": dict(card),
+    }
+    (temporary / "bundle.json").write_text(json.dumps(description, indent=1))
+    shutil.rmtree(folder, ignore_errors=True)
+    os.replace(temporary, folder)
+    return folder
+
+
+def describe(folder: str | Path) -> dict[str, Any]:
+    """Reads and checks bundle.json.
+
+    Raises:
+        BundleError: if it is missing, not JSON, or of another format version.
+    """
+    path = Path(folder) / "bundle.json"
+    try:
+        description = json.loads(path.read_text())
+    except (OSError, ValueError) as error:
+        raise BundleError(path, str(error), "a bundle folder written by train.py", "check bundle=PATH") from None
+    version = description.get("format_version") if isinstance(description, dict) else None
+    if version != FORMAT_VERSION:
+        raise BundleError(
+            path,
+            f"format version {version}",
+            f"format version {FORMAT_VERSION}",
+            "train again, or use the gns_pyg version that wrote this bundle",
+        )
+    return description
+
+
+def load(folder: str | Path) -> Simulator:
+    """Rebuilds the simulator of a bundle, in evaluation mode, on the CPU.
+
+    Raises:
+        BundleError: if a file is missing or damaged, the format version differs, or weights do not fit the model.
+    """
+    folder, description = Path(folder), describe(folder)
+    scene = Scene.from_config(description.get("scene"))
+    path = folder / "weights.safetensors"
+    try:
+        weights = load_file(path)
+        boundary = {
+            name: BoundaryPoints(weights[f"wall_pos_{name}"].numpy(), weights[f"wall_normal_{name}"].numpy())
+            for name in scene.boundary
+        }
+        simulator = Simulator(
+            scene,
+            typed(ModelConfig, description.get("model"), "model"),
+            boundary,
+            typed(Statistics, description.get("statistics"), "statistics"),
+        )
+        simulator.load_state_dict(weights)
+    except (OSError, SafetensorError, KeyError, RuntimeError) as error:
+        raise BundleError(
+            path, str(error), "the weights of the model in bundle.json", "copy the bundle again, or train again"
+        ) from None
+    return simulator.eval()

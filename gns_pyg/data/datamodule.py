@@ -1,0 +1,157 @@
+"""Cases on disk -> training, validation and test."""
+
+import math
+import os
+from collections.abc import Mapping, Sequence
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from typing import Any
+
+import pytorch_lightning as pl
+from torch.utils.data import DataLoader
+
+from gns_pyg.config import require
+from gns_pyg.data.trajectory import Trajectory
+from gns_pyg.data.windows import UpdateSampler, Windows
+from gns_pyg.errors import DataError
+from gns_pyg.scene.scene import Scene
+from gns_pyg.state import Window
+
+EMBEDDED = Path(__file__).parents[2] / "data_gen" / "embedded"
+
+
+@dataclass
+class DataConfig:
+    """Where the cases are and how they are split.
+
+    Attributes:
+        dir: folder of case_*.h5; None looks in $GNS_DATA/<scene> (default data/<scene>), then at the embedded cases.
+        test_fraction: share of cases kept for testing, the last ones, rounded up.
+        val_cases: cases kept for validation roll-outs during training.
+        workers: data-loading processes beside the main one.
+    """
+
+    dir: str | None = None
+    test_fraction: float = 0.2
+    val_cases: int = 1
+    workers: int = 0
+
+    def __post_init__(self) -> None:
+        require(0 <= self.test_fraction < 1, "data.test_fraction", self.test_fraction, "0 up to below 1", "e.g. 0.2")
+
+
+@dataclass(frozen=True)
+class Split:
+    """Cases by purpose; no case serves two."""
+
+    train: list[Trajectory]
+    val: list[Trajectory]
+    test: list[Trajectory]
+
+    def describe(self) -> dict[str, dict[str, str]]:
+        """File name -> content hash, by purpose: what a bundle remembers of its data."""
+        return {
+            purpose: {t.path.name: t.content_hash() for t in getattr(self, purpose)}
+            for purpose in ("train", "val", "test")
+        }
+
+
+def find_cases(scene: Scene, folder: str | None) -> list[Path]:
+    """The scene's case files, in order.
+
+    Raises:
+        DataError: if there is none; says where it looked and how to generate them.
+    """
+    if folder is not None:
+        places = [Path(folder)]
+    else:
+        places = [Path(os.environ.get("GNS_DATA", "data")) / scene.name, EMBEDDED / scene.name]
+    for place in places:
+        if cases := sorted(place.glob("case_*.h5")):
+            return cases
+    raise DataError(
+        " and ".join(str(place) for place in places),
+        "no case_*.h5",
+        f"cases of the scene {scene.name}",
+        f"generate them: python -m data_gen.generate -m scene={scene.name} 'case=range({scene.cases})', "
+        "or name their folder: data.dir=...",
+    )
+
+
+def split(scene: Scene, config: DataConfig) -> Split:
+    """Opens, checks and splits the cases of a scene.
+
+    Raises:
+        DataError: if a case is damaged or of another scene, or if too few are left to train on.
+    """
+    trajectories = [Trajectory(path) for path in find_cases(scene, config.dir)]
+    for trajectory in trajectories:
+        check_same_scene(trajectory, scene)
+    n_test = math.ceil(config.test_fraction * len(trajectories))
+    n_train = len(trajectories) - n_test - config.val_cases
+    if n_train < 1:
+        raise DataError(
+            trajectories[0].path.parent,
+            f"{len(trajectories)} case(s), of which {n_test} for testing and {config.val_cases} for validation",
+            "at least one left to train on",
+            "generate more cases, or lower data.test_fraction or data.val_cases",
+        )
+    return Split(trajectories[:n_train], trajectories[n_train : n_train + config.val_cases], trajectories[-n_test:] if n_test else [])
+
+
+def check_same_scene(trajectory: Trajectory, scene: Scene) -> None:
+    """Raises DataError, naming every difference, if a case was not made from what `scene` describes."""
+    ours, theirs = _physics(asdict(scene)), _physics(trajectory.scene)
+    different = [f"{key} = {theirs.get(key)!r} (scene: {ours.get(key)!r})" for key in sorted(ours | theirs) if ours.get(key) != theirs.get(key)]
+    if different:
+        raise DataError(
+            trajectory.path,
+            "; ".join(different),
+            f"a case of the scene {scene.name} as configured",
+            "choose the scene this file was made from, or generate the cases again",
+        )
+
+
+def _physics(scene: Mapping[str, Any]) -> dict[str, Any]:
+    """The part of a scene that decides how grains move, flattened to dotted keys."""
+    flat: dict[str, Any] = {}
+
+    def walk(prefix: str, value: Any) -> None:
+        if isinstance(value, Mapping):
+            for key, inner in value.items():
+                walk(f"{prefix}.{key}" if prefix else key, inner)
+        else:
+            flat[prefix] = value
+
+    walk("", {key: scene[key] for key in ("gravity_m_s2", "damping", "damping_on_gravity", "frame_dt_s", "grains", "boundary")})
+    return {key: value for key, value in flat.items() if not key.endswith(".points")}
+
+
+class DataModule(pl.LightningDataModule):
+    """Training windows of the training cases. Validation and test are roll-outs; see the callbacks and `run`.
+
+    Args:
+        cases: the split.
+        length: frames of a window.
+        batch_size: windows per update.
+        seed: of the shuffling.
+        workers: data-loading processes.
+    """
+
+    def __init__(self, cases: Split, *, length: int, batch_size: int, seed: int, workers: int) -> None:
+        super().__init__()
+        self.cases, self.batch_size, self.seed, self.workers = cases, batch_size, seed, workers
+        self.windows = Windows(cases.train, length)
+
+    def train_dataloader(self) -> DataLoader:
+        done = self.trainer.global_step if self.trainer else 0
+        return DataLoader(
+            self.windows,
+            batch_sampler=UpdateSampler(len(self.windows), self.batch_size, self.seed, done),
+            collate_fn=_collate,
+            num_workers=self.workers,
+        )
+
+
+def _collate(windows: Sequence[Window]) -> Window:
+    return Window.collate(list(windows))

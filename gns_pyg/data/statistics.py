@@ -1,0 +1,40 @@
+"""Scales of the training cases."""
+
+from collections.abc import Sequence
+
+import numpy as np
+import torch
+
+from gns_pyg.data.trajectory import Trajectory
+from gns_pyg.data.windows import read_window
+from gns_pyg.dynamics.integrator import Integrator
+from gns_pyg.models.statistics import Statistics
+
+FRAMES_PER_CASE = 50
+
+
+def measure(trajectories: Sequence[Trajectory], integrator: Integrator) -> Statistics:
+    """Root mean squares over frames spread evenly over the training cases (see `Statistics`)."""
+    velocity, spin, position, corrections = [], [], [], []
+    for trajectory in trajectories:
+        last = trajectory.n_frames - 3
+        for start in np.unique(np.linspace(0, max(last, 0), FRAMES_PER_CASE).astype(int)):
+            window = read_window(trajectory, int(start), 3)
+            state, following = integrator.read(window, 1), integrator.read(window, 2)
+            velocity.append(state.vel.square().mean())
+            spin.append(window.ang_vel[1].square().mean())
+            position.append(state.pos)
+            groups = integrator.target(state, following).split(3, dim=1)
+            corrections.append(torch.stack([group.square().mean() for group in groups]))
+    everywhere = torch.cat(position)
+    return Statistics(
+        velocity_m_s=_root(velocity),
+        spin_rad_s=max(_root(spin), 1e-12),
+        correction=torch.stack(corrections).mean(0).sqrt().tolist(),
+        position_mean_m=everywhere.mean(0).tolist(),
+        position_std_m=float((everywhere - everywhere.mean(0)).square().mean().sqrt()),
+    )
+
+
+def _root(squares: list[torch.Tensor]) -> float:
+    return float(torch.stack(squares).mean().sqrt())

@@ -1,0 +1,73 @@
+"""Short stretches of consecutive frames: what a model trains on."""
+
+from collections.abc import Iterator, Sequence
+
+import numpy as np
+import torch
+from torch.utils.data import Dataset, Sampler
+
+from gns_pyg.data.trajectory import Trajectory
+from gns_pyg.errors import DataError
+from gns_pyg.state import Window
+
+
+def read_window(trajectory: Trajectory, start: int, length: int) -> Window:
+    """Frames [start, start + length) of a case; the arrays are fresh copies."""
+    fields = ("position", "velocity", "angular_velocity")
+    pos, vel, ang_vel = (torch.from_numpy(trajectory.read(field, start, start + length)) for field in fields)
+    return Window(
+        pos=pos,
+        vel=vel,
+        ang_vel=ang_vel,
+        radius=torch.from_numpy(trajectory.radius),
+        time_s=torch.tensor([trajectory.times_s[start]], dtype=torch.float64),
+        batch=torch.zeros(trajectory.n_grains, dtype=torch.long),
+        frame_dt_s=trajectory.frame_dt_s,
+    )
+
+
+class Windows(Dataset):
+    """Every stretch of `length` frames of every case.
+
+    Raises:
+        DataError: for a case with fewer frames than `length`.
+    """
+
+    def __init__(self, trajectories: Sequence[Trajectory], length: int) -> None:
+        self.trajectories, self.length = list(trajectories), length
+        for trajectory in self.trajectories:
+            if trajectory.n_frames < length:
+                raise DataError(
+                    trajectory.path,
+                    f"{trajectory.n_frames} frames",
+                    f"at least {length}, the length of one training window",
+                    "use longer cases or lower training.unroll",
+                )
+        self.starts = np.cumsum([0] + [t.n_frames - length + 1 for t in self.trajectories])
+
+    def __len__(self) -> int:
+        return int(self.starts[-1])
+
+    def __getitem__(self, item: int) -> Window:
+        case = int(np.searchsorted(self.starts, item, side="right")) - 1
+        return read_window(self.trajectories[case], item - int(self.starts[case]), self.length)
+
+
+class UpdateSampler(Sampler):
+    """Endless batches of shuffled items; batch number `update` is a function of the seed alone, so a resumed run
+    goes on exactly where it stopped."""
+
+    def __init__(self, n_items: int, batch_size: int, seed: int, first_update: int = 0) -> None:
+        self.n_items, self.batch_size, self.seed, self.first_update = n_items, batch_size, seed, first_update
+
+    def __iter__(self) -> Iterator[list[int]]:
+        position, order, epoch = self.first_update * self.batch_size, None, -1
+        while True:
+            batch = []
+            for place in range(position, position + self.batch_size):
+                if place // self.n_items != epoch:
+                    epoch = place // self.n_items
+                    order = np.random.default_rng((self.seed, epoch)).permutation(self.n_items)
+                batch.append(int(order[place % self.n_items]))
+            position += self.batch_size
+            yield batch

@@ -1,0 +1,82 @@
+"""From a correction to the next state, and back: `target` is the exact inverse of `integrate`.
+
+A correction is what contacts add to what a grain would do without them, in columns of three:
+mean velocity over the step (m/s), then, if the state holds them, end velocity (m/s) and angular velocity (rad/s).
+Without `residual` the first group is the mean velocity itself, as in the paper.
+"""
+
+from dataclasses import replace
+
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+from gns_pyg.config import require
+from gns_pyg.scene.free_flight import free_flight
+from gns_pyg.scene.scene import Scene
+from gns_pyg.state import State, Window
+
+STATES = ("differences", "velocity", "full")
+
+
+class Integrator:
+    """Moves a state by one frame.
+
+    Args:
+        scene: gives the free-flight law and the frame step.
+        state: what a state holds. `differences`: position and (x(t) - x(t - dt)) / dt, as in the paper; `velocity`:
+            position and instantaneous velocity; `full`: angular velocity too.
+        residual: corrections are taken relative to free flight; else relative to standing still.
+    """
+
+    def __init__(self, scene: Scene, state: str, *, residual: bool) -> None:
+        require(state in STATES, "model.state", state, " or ".join(STATES), "pick one of them")
+        self.scene, self.state, self.residual = scene, state, residual
+        self.dt_s = scene.frame_dt_s
+        self.n_groups = 1 + STATES.index(state)
+
+    def read(self, window: Window, frame: int) -> State:
+        """The state at `frame` of a window; `differences` also reads the frame before."""
+        if self.state == "differences":
+            vel = (window.pos[frame] - window.pos[frame - 1]) / self.dt_s
+        else:
+            vel = window.vel[frame]
+        return State(
+            pos=window.pos[frame],
+            vel=vel,
+            ang_vel=window.ang_vel[frame] if self.state == "full" else None,
+            radius=window.radius,
+            time_s=window.time_s + frame * self.dt_s,
+            batch=window.batch,
+        )
+
+    def without_contact(self, state: State) -> State:
+        """Where the state would be one frame later if nothing touched (`residual`), or if it stood still."""
+        later = state.time_s + self.dt_s
+        if not self.residual:
+            still = torch.zeros_like(state.vel)
+            return replace(state, vel=still, ang_vel=None if state.ang_vel is None else still, time_s=later)
+        pos, vel = free_flight(state.pos, state.vel, self.scene, self.dt_s)
+        if self.state == "differences":  # the mean velocity of one frame passes into that of the next
+            pos = state.pos + vel * self.dt_s
+        return replace(state, pos=pos, vel=vel, time_s=later)
+
+    def integrate(self, state: State, correction: Float[Tensor, "n_grains d"]) -> State:
+        """The next state, one frame later (the paper's equation (11) for `differences`)."""
+        free = self.without_contact(state)
+        mean, *rest = correction.to(state.pos.dtype).split(3, dim=1)
+        pos = free.pos + mean * self.dt_s
+        if self.state == "differences":
+            return replace(free, pos=pos, vel=(pos - state.pos) / self.dt_s)
+        ang_vel = free.ang_vel + rest[1] if self.state == "full" and free.ang_vel is not None else None
+        return replace(free, pos=pos, vel=free.vel + rest[0], ang_vel=ang_vel)
+
+    def target(self, state: State, following: State) -> Float[Tensor, "n_grains d"]:
+        """The correction that takes `state` to `following`."""
+        free = self.without_contact(state)
+        groups = [(following.pos - free.pos) / self.dt_s]
+        if self.state != "differences":
+            groups.append(following.vel - free.vel)
+        if free.ang_vel is not None and following.ang_vel is not None:
+            groups.append(following.ang_vel - free.ang_vel)
+        return torch.cat(groups, dim=1)

@@ -1,0 +1,45 @@
+"""The choices that make a model; conf/model/*.yaml are its files."""
+
+from dataclasses import dataclass
+
+from omegaconf import MISSING
+
+from gns_pyg.config import require
+
+
+@dataclass
+class ModelConfig:
+    """Architecture of a simulator.
+
+    Attributes:
+        state: `differences`, `velocity` or `full` (see `dynamics.integrator`).
+        residual: predict the difference to the scene's free flight; else the velocity itself (the paper).
+        absolute_position: give networks the absolute position (the paper; breaks translation invariance).
+        contact_features: gap, approach and slip on edges, beside the geometry of Mayr et al.
+        self_loops: an edge from every grain to itself, so that one without neighbours is computed too (the paper).
+        skip: skip connections and layer norms (not in the paper).
+        hidden, layers, mlp_layers: width, rounds of message passing, linear layers of each MLP.
+        cutoff_grain_radii, cutoff_wall_radii: reach of the two searches, in grain radii.
+        neighbors: search backend, or `auto`.
+    """
+
+    state: str = MISSING
+    residual: bool = MISSING
+    absolute_position: bool = MISSING
+    contact_features: bool = MISSING
+    self_loops: bool = MISSING
+    skip: bool = MISSING
+    hidden: int = MISSING
+    layers: int = MISSING
+    mlp_layers: int = MISSING
+    cutoff_grain_radii: float = MISSING
+    cutoff_wall_radii: float = MISSING
+    neighbors: str = "auto"
+
+    def __post_init__(self) -> None:
+        for key in ("cutoff_grain_radii", "cutoff_wall_radii"):
+            value = getattr(self, key)
+            require(value > 0, f"model.{key}", value, "above 0", "2.5 is the paper's")
+        for key, least in (("hidden", 1), ("layers", 1), ("mlp_layers", 2)):
+            value = getattr(self, key)
+            require(value >= least, f"model.{key}", value, f"at least {least}", f"set model.{key} to {least} or more")

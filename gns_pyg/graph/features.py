@@ -1,0 +1,90 @@
+"""Node and edge features, dimensionless: lengths over the grain radius, velocities over the training data's scale.
+
+Differences are taken in float64 by the caller's positions; callers cast the result to the model's dtype.
+Edge features follow Mayr et al. 2023 (the paper's [17]): relative position, distance, direction and inverse powers of
+the distance; `contact` adds what a contact law would ask for: gap, approach, slip with spin, and the gap to come.
+"""
+
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+from gns_pyg.state import Graph, State, Walls
+
+N_GEOMETRY = 9
+N_CONTACT = 10
+
+
+def grain_edges(
+    state: State, graph: Graph, *, velocity_m_s: float, dt_s: float, contact: bool
+) -> Float[Tensor, "n_grain_edges f"]:
+    """Features of grain-grain edges; `rel_pos` points from receiver to sender."""
+    sender, receiver = graph.grain_edges
+    rel_pos = state.pos[sender] - state.pos[receiver]
+    radius, touch = state.radius[receiver], state.radius[sender] + state.radius[receiver]
+    distance, direction = _polar(rel_pos, radius)
+    features = _geometry(rel_pos, distance, direction, radius)
+    if contact:
+        rel_vel = state.vel[sender] - state.vel[receiver]
+        slip = rel_vel
+        if state.ang_vel is not None:  # surface velocities at the contact: v + w x arm, arms of opposite sign
+            turning = state.radius[sender, None] * state.ang_vel[sender] + radius[:, None] * state.ang_vel[receiver]
+            slip = rel_vel - torch.linalg.cross(turning, direction)
+        ahead = torch.linalg.vector_norm(rel_pos + rel_vel * dt_s, dim=1)
+        features += _contact(distance - touch, ahead - touch, rel_vel, slip, direction, radius, velocity_m_s, dt_s)
+    return torch.cat(features, dim=1)
+
+
+def wall_edges(
+    state: State, walls: Walls, graph: Graph, *, velocity_m_s: float, dt_s: float, contact: bool
+) -> Float[Tensor, "n_wall_edges f"]:
+    """Features of edges from boundary points to grains; the gap is that to the point's tangent plane."""
+    point, grain = graph.wall_edges
+    rel_pos, radius, normal = walls.pos[point] - state.pos[grain], state.radius[grain], walls.normal[point]
+    distance, direction = _polar(rel_pos, radius)
+    height = -(rel_pos * normal).sum(1)
+    features = [*_geometry(rel_pos, distance, direction, radius), (height / radius)[:, None]]
+    if contact:
+        rel_vel = walls.vel[point] - state.vel[grain]
+        slip = rel_vel
+        if state.ang_vel is not None:
+            slip = rel_vel + torch.linalg.cross(radius[:, None] * state.ang_vel[grain], normal)
+        ahead = height - (rel_vel * normal).sum(1) * dt_s
+        features += _contact(height - radius, ahead - radius, rel_vel, slip, -normal, radius, velocity_m_s, dt_s)
+    return torch.cat(features, dim=1)
+
+
+def n_grain_edge_features(contact: bool) -> int:
+    return N_GEOMETRY + contact * N_CONTACT
+
+
+def n_wall_edge_features(contact: bool) -> int:
+    return N_GEOMETRY + 1 + contact * N_CONTACT
+
+
+def _polar(rel_pos: Tensor, radius: Tensor) -> tuple[Tensor, Tensor]:
+    """Distance and direction; the direction of coincident points is zero, and its gradient stays bounded."""
+    distance = torch.linalg.vector_norm(rel_pos, dim=1)
+    return distance, rel_pos / torch.maximum(distance, 1e-3 * radius)[:, None]
+
+
+def _geometry(rel_pos: Tensor, distance: Tensor, direction: Tensor, radius: Tensor) -> list[Tensor]:
+    near = radius / torch.maximum(distance, 0.1 * radius)
+    scalars = torch.stack([distance / radius, near, near**2], dim=1)
+    return [rel_pos / radius[:, None], direction, scalars]
+
+
+def _contact(
+    gap: Tensor,
+    gap_ahead: Tensor,
+    rel_vel: Tensor,
+    slip: Tensor,
+    direction: Tensor,
+    radius: Tensor,
+    velocity_m_s: float,
+    dt_s: float,
+) -> list[Tensor]:
+    approach = (rel_vel * direction).sum(1, keepdim=True)
+    tangential = slip - (slip * direction).sum(1, keepdim=True) * direction
+    gaps = torch.stack([gap / radius, (gap / radius).clamp(max=0), gap_ahead / radius], dim=1)
+    return [gaps, approach / velocity_m_s, rel_vel / velocity_m_s, tangential / velocity_m_s]

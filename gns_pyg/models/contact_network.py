@@ -1,0 +1,71 @@
+"""Encode, process, decode over one kind of contact: the paper's equations (5) to (9)."""
+
+import torch
+from jaxtyping import Float, Int
+from torch import Tensor, nn
+
+from gns_pyg.models.interaction import Interaction
+from gns_pyg.models.mlp import mlp
+
+
+class ContactNetwork(nn.Module):
+    """What contacts do to receiving grains. A grain that no edge reaches gets exactly zero, at no cost.
+
+    Args:
+        n_sender: features of a sender; None where senders are the receivers themselves (grain-grain contact).
+        n_receiver: features of a receiving grain.
+        n_edge: features of an edge.
+        n_out: outputs per grain.
+        hidden, layers, mlp_layers: width, rounds of message passing, linear layers of each MLP.
+        skip: skip connections and layer norms (see `Interaction`).
+    """
+
+    def __init__(
+        self,
+        *,
+        n_sender: int | None,
+        n_receiver: int,
+        n_edge: int,
+        n_out: int,
+        hidden: int,
+        layers: int,
+        mlp_layers: int,
+        skip: bool,
+    ) -> None:
+        super().__init__()
+        self.n_out = n_out
+
+        def encoder(n_in: int) -> nn.Module:
+            return mlp(n_in, hidden, hidden, mlp_layers, layer_norm=skip)
+
+        self.encode_sender = None if n_sender is None else encoder(n_sender)
+        self.encode_receiver, self.encode_edge = encoder(n_receiver), encoder(n_edge)
+        self.interactions = nn.ModuleList(Interaction(hidden, mlp_layers, skip=skip) for _ in range(layers))
+        self.decode = mlp(hidden, hidden, n_out, mlp_layers)
+
+    def forward(
+        self,
+        sender_features: Float[Tensor, "n_senders n_sender"] | None,
+        receiver_features: Float[Tensor, "n_receivers n_receiver"],
+        edge_features: Float[Tensor, "n_edges n_edge"],
+        edge_index: Int[Tensor, "2 n_edges"],
+    ) -> Float[Tensor, "n_receivers n_out"]:
+        """Returns the contacts' effect on every receiver.
+
+        Where senders are the receivers, `sender_features` is None and every sender must also receive
+        (edges come in both directions), so that grains without an edge can be left out of the computation.
+        """
+        reached, receiver = edge_index[1].unique(return_inverse=True)
+        receivers = self.encode_receiver(receiver_features[reached])
+        if self.encode_sender is None:
+            sender = torch.searchsorted(reached, edge_index[0])
+        else:
+            reaching, sender = edge_index[0].unique(return_inverse=True)
+            senders = self.encode_sender(sender_features[reaching])
+        edges, compact = self.encode_edge(edge_features), torch.stack([sender, receiver])
+        for interaction in self.interactions:
+            receivers, edges = interaction(
+                receivers if self.encode_sender is None else senders, receivers, edges, compact
+            )
+        out = receiver_features.new_zeros(receiver_features.shape[0], self.n_out)
+        return out.index_copy(0, reached, self.decode(receivers))

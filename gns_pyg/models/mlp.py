@@ -1,0 +1,16 @@
+"""The one kind of small network everything else is made of."""
+
+from torch import nn
+
+
+def mlp(n_in: int, hidden: int, n_out: int, layers: int, *, layer_norm: bool = False) -> nn.Sequential:
+    """A perceptron of `layers` linear layers with ReLU between them, (n, n_in) -> (n, n_out).
+
+    `layer_norm` normalises the output.
+    """
+    widths = [n_in, *[hidden] * (layers - 1), n_out]
+    modules: list[nn.Module] = []
+    for wide, narrow in zip(widths[:-1], widths[1:], strict=True):
+        modules += [nn.Linear(wide, narrow), nn.ReLU()]
+    modules.pop()
+    return nn.Sequential(*modules, *([nn.LayerNorm(n_out)] if layer_norm else []))
