@@ -221,6 +221,8 @@ def evaluate_cases(results: Sequence[CaseResult], climatology: Climatology, scen
         values = np.array([case.metrics[key] for case in cases], np.float64)
         if key == "test/escaped_grains":
             metrics[key] = int(values.sum())
+        elif key == "speed/yade_cores":
+            metrics[key] = int(values.max())
         elif key.endswith("_standard_error_deg"):
             metrics[key] = float(np.sqrt((values**2).sum()) / len(values))
         else:

@@ -224,10 +224,12 @@ def escaped_grains(pos: np.ndarray, times_s: np.ndarray, scene: Scene) -> np.nda
         if not mesh.is_watertight:
             continue
         closed += 1
-        interior = _Interior(mesh, 2 * scene.grains.radius_m)
+        affordable_m = (mesh.extents.prod() / max(pos.shape[0] * pos.shape[1] / 4, 1)) ** (1 / 3)  # a cell per 4 tests
+        interior = _Interior(mesh, max(2 * scene.grains.radius_m, affordable_m))
         for index, (frame, time_s) in enumerate(zip(pos, times_s, strict=True)):
-            points, times = torch.from_numpy(np.ascontiguousarray(frame)), torch.full((len(frame),), float(time_s), dtype=torch.float64)
-            out[index] &= ~interior(to_body(part.motion, points, times).numpy())
+            at = torch.full((len(frame),), float(time_s), dtype=torch.float64)
+            in_body = to_body(part.motion, torch.from_numpy(np.ascontiguousarray(frame)), at)
+            out[index] &= ~interior(in_body.numpy())
     return out.sum(axis=1) if closed else np.zeros(len(pos), int)
 
 
