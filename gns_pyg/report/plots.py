@@ -1,0 +1,282 @@
+"""Figures of an evaluation, each as PNG and SVG. Colours are Okabe and Ito's, which colour-blind readers tell apart;
+DEM, network and climatology also differ by line style, so that a print in black and white reads too."""
+
+from collections.abc import Callable
+from pathlib import Path
+
+import numpy as np
+import torch
+from matplotlib.axes import Axes
+from matplotlib.backends.backend_agg import FigureCanvasAgg
+from matplotlib.collections import EllipseCollection, LineCollection
+from matplotlib.colors import Normalize
+from matplotlib.figure import Figure
+from matplotlib.lines import Line2D
+from trimesh import Trimesh
+
+from gns_pyg.evaluation.metrics import CaseEvaluation, Evaluation, Observables
+from gns_pyg.evaluation.observables import finite_difference_velocity, up_direction
+from gns_pyg.scene.mesh import build_mesh
+from gns_pyg.scene.motion import to_world
+from gns_pyg.scene.scene import Scene
+
+BLUE, VERMILION, GREEN, PURPLE, ORANGE, SKY = "#0072B2", "#D55E00", "#009E73", "#CC79A7", "#E69F00", "#56B4E9"
+CASE_COLORS = (BLUE, VERMILION, GREEN, PURPLE, ORANGE, SKY)
+DEM, NETWORK, CLIMATOLOGY = "-", "--", ":"
+PAPER_FINAL_ERROR_MM = {"hopper": 93.9, "drum": 79.0}  # sections 5.1: hopper at 2 s, drum at 3 s
+SPEED_QUANTILE = 0.99  # the colour scale ends here, so that one fast grain does not darken all others
+
+
+def write_plots(evaluation: Evaluation, scene: Scene, folder: str | Path) -> list[Path]:
+    """Draws every figure that the evaluation has data for.
+
+    Returns:
+        The files written, per figure PNG then SVG: rollout_error, one_step_error, center_of_mass, angle_of_repose
+        (where the scene defines it), overlap, snapshots.
+    """
+    folder = Path(folder)
+    folder.mkdir(parents=True, exist_ok=True)
+    figures = {
+        "rollout_error": rollout_error(evaluation, scene),
+        "one_step_error": one_step_error(evaluation, scene),
+        "center_of_mass": center_of_mass_height(evaluation, scene),
+    }
+    if scene.angle_of_repose is not None:
+        figures["angle_of_repose"] = angle_of_repose(evaluation, scene)
+    figures["overlap"] = overlap(evaluation, scene)
+    figures["snapshots"] = snapshots(evaluation.cases[0], scene)
+    files = []
+    for name, figure in figures.items():
+        for ending in ("png", "svg"):
+            path = folder / f"{name}.{ending}"
+            figure.savefig(path, dpi=150, bbox_inches="tight")
+            files.append(path)
+    return files
+
+
+def rollout_error(evaluation: Evaluation, scene: Scene) -> Figure:
+    """Position error of the roll-out against time: every case thin, their mean bold, beside frozen grains."""
+    figure, axes = _figure(f"{scene.name}: position error of the roll-out", "mean distance from DEM (mm)")
+    for case in evaluation.cases:
+        axes.plot(case.result.times_s, 1e3 * case.error_m, color=BLUE, linewidth=0.7, alpha=0.6)
+    axes.plot(*_mean_curve(evaluation, lambda case: case.error_m, 1e3), color=BLUE, linewidth=2.2, label="network")
+    frozen = _mean_curve(evaluation, lambda case: case.frozen_error_m, 1e3)
+    axes.plot(*frozen, color=ORANGE, linewidth=1.6, linestyle="-.", label="frozen at the start")
+    if scene.name in PAPER_FINAL_ERROR_MM:
+        final = PAPER_FINAL_ERROR_MM[scene.name]
+        axes.axhline(final, color="0.35", linestyle=":", label=f"paper's network at the end: {final:g} mm")
+    n_cases = len(evaluation.cases)
+    return _finish(figure, axes, note=f"mean of {n_cases} test cases bold, each case thin" if n_cases > 1 else "")
+
+
+def one_step_error(evaluation: Evaluation, scene: Scene) -> Figure:
+    """One-step position error along the runs, beside the best trivial predictor."""
+    figure, axes = _figure(f"{scene.name}: one-step position error", "mean distance from DEM (mm)")
+    for case in evaluation.cases:
+        times_s = case.result.one_step_times_s
+        axes.plot(times_s, 1e3 * case.result.one_step_error_m, color=BLUE, linewidth=0.7, alpha=0.5)
+    common = min((case.result.one_step_times_s for case in evaluation.cases), key=len)
+    own = [case.result.one_step_error_m[: len(common)] for case in evaluation.cases]
+    trivial = [case.result.trivial_error_m[evaluation.trivial_name][: len(common)] for case in evaluation.cases]
+    axes.plot(common, 1e3 * np.mean(own, axis=0), color=BLUE, linewidth=2.2, label="network")
+    label = f"best trivial predictor: {evaluation.trivial_name}"
+    axes.plot(common, 1e3 * np.mean(trivial, axis=0), color=VERMILION, linewidth=1.6, linestyle="-.", label=label)
+    frame_ms = 1e3 * scene.frame_dt_s
+    return _finish(figure, axes, note=f"one step is {frame_ms:g} ms, always from DEM's own state")
+
+
+def center_of_mass_height(evaluation: Evaluation, scene: Scene) -> Figure:
+    """Height of the centre of mass against time, every test case."""
+    up = up_direction(scene)
+    figure, axes = _figure(f"{scene.name}: height of the centre of mass", "height (mm)")
+    _compare(axes, evaluation, lambda observed: 1e3 * observed.center_of_mass_m @ up)
+    times_s = _longest(evaluation)
+    climatology = evaluation.climatology.center_of_mass_at(times_s) @ up
+    axes.plot(times_s, 1e3 * climatology, color="black", linestyle=CLIMATOLOGY, linewidth=1.8)
+    return _finish(figure, axes, handles=_style_handles(evaluation, climatology=True))
+
+
+def angle_of_repose(evaluation: Evaluation, scene: Scene) -> Figure:
+    """Angle of repose against time, every test case; the averaged part is shaded."""
+    figure, axes = _figure(f"{scene.name}: angle of repose", "angle of the free surface (degrees)")
+
+    def angle(observed: Observables) -> np.ndarray:
+        return np.zeros(0) if observed.angle_of_repose_deg is None else observed.angle_of_repose_deg
+
+    _compare(axes, evaluation, angle)
+    times_s, known = _longest(evaluation), evaluation.climatology
+    if known.angle_of_repose_deg is not None:
+        climatology = np.interp(times_s, known.times_s, known.angle_of_repose_deg)
+        axes.plot(times_s, climatology, color="black", linestyle=CLIMATOLOGY, linewidth=1.8)
+    note = ""
+    if scene.angle_of_repose is not None and scene.angle_of_repose.from_s < times_s[-1]:
+        axes.axvspan(max(scene.angle_of_repose.from_s, times_s[0]), times_s[-1], color="0.92", zorder=0)
+        note = "averaged over the shaded part"
+    return _finish(figure, axes, handles=_style_handles(evaluation, climatology=True), note=note)
+
+
+def overlap(evaluation: Evaluation, scene: Scene) -> Figure:
+    """Mean overlap of touching pairs against time, every test case."""
+    figure, axes = _figure(f"{scene.name}: overlap of touching grains", "mean overlap (% of a diameter)")
+    _compare(axes, evaluation, lambda observed: 100 * observed.overlap_ratio)
+    if any((case.model.overlap_ratio > 0).any() for case in evaluation.cases):
+        axes.set_yscale("log")
+    return _finish(figure, axes, handles=_style_handles(evaluation, climatology=False), note="frame 0 is DEM's own")
+
+
+def snapshots(case: CaseEvaluation, scene: Scene, n_times: int = 4) -> Figure:
+    """DEM above network at `n_times` times of one case, grains in their true size coloured by speed.
+
+    Speed is the displacement to the next frame over the time between, in both rows. The view is along the axis of a
+    turning or plane scene, else along a horizontal axis.
+    """
+    result = case.result
+    frames = np.unique(np.linspace(0, len(result.times_s) - 2, n_times).round().astype(int))
+    right, up, depth = _view(scene)
+    rows = {"DEM": result.dem_pos, "network": result.pos}
+    speeds = {
+        name: np.linalg.norm(finite_difference_velocity(pos, result.times_s)[frames], axis=2)
+        for name, pos in rows.items()
+    }
+    scale = Normalize(0.0, max(float(np.quantile(np.stack(list(speeds.values())), SPEED_QUANTILE)), 1e-6))
+    (left, low), (edge, high) = _frame_of_view(result.dem_pos, scene, right, up)
+    width = 2.3
+    size = (width * len(frames) + 1.0, 2 * width * float(np.clip((high - low) / (edge - left), 0.5, 2.0)) + 0.9)
+    figure = _bare_figure(size)
+    grid = figure.subplots(2, len(frames), squeeze=False, sharex=True, sharey=True)
+    diameters = 2 * result.radius
+    for row, (name, pos) in zip(grid, rows.items(), strict=True):
+        for axes, frame, speed in zip(row, frames, speeds[name], strict=True):
+            order = np.argsort(pos[frame] @ depth)
+            points = np.stack([pos[frame][order] @ right, pos[frame][order] @ up], axis=1)
+            grains = EllipseCollection(
+                diameters[order], diameters[order], 0.0, units="xy", offsets=points, offset_transform=axes.transData
+            )
+            grains.set(array=speed[order], norm=scale, cmap="cividis", edgecolor="0.15", linewidth=0.15)
+            grains.set_rasterized(True)  # thousands of circles would make an SVG of many megabytes
+            axes.add_collection(grains)
+            axes.add_collection(_wall_lines(scene, float(result.times_s[frame]), right, up, depth))
+            axes.set(xlim=(left, edge), ylim=(low, high), aspect="equal", xticks=[], yticks=[])
+            axes.spines[:].set_visible(False)
+        row[0].set_ylabel(name, fontsize=11)
+    for axes, frame in zip(grid[0], frames, strict=True):
+        axes.set_title(f"t = {result.times_s[frame]:.2f} s", fontsize=10)
+    figure.colorbar(grains, ax=grid, label="speed (m/s)", shrink=0.7, extend="max", pad=0.02)
+    figure.suptitle(f"{scene.name}, test case {result.name}: DEM and network from the same start", fontsize=11)
+    return figure
+
+
+# --------------------------------------------------------------------------------------------------- building blocks
+
+
+def _bare_figure(size: tuple[float, float]) -> Figure:
+    """A figure outside pyplot: nothing global, nothing to close."""
+    figure = Figure(figsize=size, layout="constrained")
+    FigureCanvasAgg(figure)
+    return figure
+
+
+def _figure(title: str, ylabel: str) -> tuple[Figure, Axes]:
+    figure = _bare_figure((6.4, 4.0))
+    axes = figure.subplots()
+    axes.set_title(title, fontsize=11)
+    axes.set(xlabel="time (s)", ylabel=ylabel)
+    axes.grid(color="0.88", linewidth=0.6)
+    axes.spines[["top", "right"]].set_visible(False)
+    return figure, axes
+
+
+def _finish(figure: Figure, axes: Axes, handles: list[Line2D] | None = None, note: str = "") -> Figure:
+    if axes.get_yscale() == "linear":
+        axes.set_ylim(bottom=min(0.0, axes.get_ylim()[0]))
+    axes.margins(x=0.01)
+    if handles is None:
+        handles, _ = axes.get_legend_handles_labels()
+    axes.legend(
+        handles=handles,
+        loc="upper left",
+        bbox_to_anchor=(0.0, -0.14),
+        ncols=3 if len(handles) > 3 else 2,
+        frameon=False,
+        fontsize=9,
+        title=note or None,
+        title_fontsize=8,
+        alignment="left",
+    )
+    return figure
+
+
+def _compare(axes: Axes, evaluation: Evaluation, of: Callable[[Observables], np.ndarray]) -> None:
+    """Draws one curve of every case: DEM solid, network dashed, a colour per case."""
+    for index, case in enumerate(evaluation.cases):
+        color, times_s = CASE_COLORS[index % len(CASE_COLORS)], case.result.times_s
+        axes.plot(times_s, of(case.dem), color=color, linestyle=DEM, linewidth=1.2)
+        axes.plot(times_s, of(case.model), color=color, linestyle=NETWORK, linewidth=1.6)
+
+
+def _style_handles(evaluation: Evaluation, climatology: bool) -> list[Line2D]:
+    styles = {"DEM": DEM, "network": NETWORK}
+    if climatology:
+        styles["mean of training cases"] = CLIMATOLOGY
+    handles = [Line2D([], [], color="black", linestyle=style, label=name) for name, style in styles.items()]
+    if len(evaluation.cases) <= len(CASE_COLORS):
+        for color, case in zip(CASE_COLORS, evaluation.cases, strict=False):
+            handles.append(Line2D([], [], color=color, linewidth=4, label=case.result.name))
+    return handles
+
+
+def _mean_curve(
+    evaluation: Evaluation, of: Callable[[CaseEvaluation], np.ndarray], factor: float
+) -> tuple[np.ndarray, np.ndarray]:
+    """Times and mean over cases, as far as all of them reach."""
+    shortest = min((case.result.times_s for case in evaluation.cases), key=len)
+    return shortest, factor * np.mean([of(case)[: len(shortest)] for case in evaluation.cases], axis=0)
+
+
+def _longest(evaluation: Evaluation) -> np.ndarray:
+    return max((case.result.times_s for case in evaluation.cases), key=len)
+
+
+def _view(scene: Scene) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Unit vectors to the right, up (against gravity) and towards the reader."""
+    up = up_direction(scene)
+    definition = scene.angle_of_repose
+    wanted = [np.asarray(definition.axis, float)] if definition is not None and definition.kind == "plane" else []
+    wanted += [np.asarray(part.motion.axis, float) for part in scene.boundary.values() if part.motion.moves]
+    wanted += [np.array([0.0, -1.0, 0.0]), np.array([1.0, 0.0, 0.0])]
+    across = (axis - (axis @ up) * up for axis in wanted)
+    depth = next(axis / np.linalg.norm(axis) for axis in across if np.linalg.norm(axis) > 1e-6)
+    return np.cross(up, depth), up, depth
+
+
+def _frame_of_view(pos: np.ndarray, scene: Scene, right: np.ndarray, up: np.ndarray) -> np.ndarray:
+    """Corners (2, 2) of the view: the still boundary or all of DEM's grains, with a margin."""
+    seen = [pos.reshape(-1, 3)] if not scene.boundary else []
+    for name, part in scene.boundary.items():
+        vertices = build_mesh(name, part).vertices
+        turn = np.linspace(0, 2 * np.pi / abs(part.motion.rate_rad_s), 13) if part.motion.moves else np.zeros(1)
+        placed = to_world(part.motion, torch.tensor(np.array(vertices)), torch.from_numpy(turn))[0]
+        seen.append(placed.reshape(-1, 3).numpy())
+    points = np.concatenate(seen) @ np.stack([right, up], axis=1)
+    margin = 0.04 * np.ptp(points, axis=0).max() + scene.grains.radius_m * (not scene.boundary)
+    return np.stack([points.min(axis=0) - margin, points.max(axis=0) + margin])
+
+
+def _wall_lines(scene: Scene, time_s: float, right: np.ndarray, up: np.ndarray, depth: np.ndarray) -> LineCollection:
+    """Silhouette of every boundary part as it stands at `time_s`."""
+    lines = []
+    for name, part in scene.boundary.items():
+        mesh = build_mesh(name, part)
+        vertices = torch.tensor(np.array(mesh.vertices))
+        placed = to_world(part.motion, vertices, torch.tensor([time_s], dtype=torch.float64))[0][0].numpy()
+        edges = _silhouette(Trimesh(placed, mesh.faces, process=False), depth)
+        lines.append(placed[edges] @ np.stack([right, up], axis=1))
+    return LineCollection(np.concatenate(lines) if lines else [], colors="0.3", linewidths=0.8)
+
+
+def _silhouette(mesh: Trimesh, depth: np.ndarray) -> np.ndarray:
+    """Edges (n, 2) between a triangle that faces the reader and one that does not, and open edges."""
+    faces_reader = mesh.face_normals @ depth > 1e-9
+    turns = faces_reader[mesh.face_adjacency[:, 0]] != faces_reader[mesh.face_adjacency[:, 1]]
+    edges, counts = np.unique(mesh.edges_sorted, axis=0, return_counts=True)
+    return np.concatenate([mesh.face_adjacency_edges[turns], edges[counts == 1]])

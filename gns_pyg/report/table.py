@@ -1,0 +1,106 @@
+"""The few lines that a run ends with: what the network does, beside what costs nothing and beside DEM."""
+
+from collections.abc import Mapping
+from typing import Any
+
+MISSING = "-"
+
+
+def metrics_table(metrics: Mapping[str, Any], title: str, places: Mapping[str, object]) -> str:
+    """Lays out the metrics of `evaluate_cases` as plain text in human units.
+
+    Args:
+        metrics: the flat dict of metrics.
+        title: first line, e.g. the scene and the number of test cases.
+        places: what -> where: run folder, plots, bundle.
+    """
+    return "\n".join([title, _grid(metric_rows(metrics)), *(f"{what}: {where}" for what, where in places.items())])
+
+
+def metric_rows(metrics: Mapping[str, Any]) -> list[tuple[str, str, str]]:
+    """Rows of (what, network, beside), the first one the heading; also what the page shows."""
+
+    def millimetres(key: str) -> str:
+        return _number(metrics.get(key), 1e3, " mm")
+
+    def degrees(key: str) -> str:
+        return _number(metrics.get(key), 1.0, "\N{DEGREE SIGN}")
+
+    def with_error(key: str, error: str) -> str:
+        value = metrics.get(error)
+        return degrees(key) + (f" \N{PLUS-MINUS SIGN} {value:.1g}\N{DEGREE SIGN}" if _known(value) else "")
+
+    trivial = millimetres("test/one_step_error_trivial_m")
+    rows = [
+        ("", "network", "beside"),
+        (
+            "one-step error, whole run",
+            millimetres("test/one_step_error_m"),
+            f"{trivial} {metrics.get('test/one_step_error_trivial_name', '')} (best trivial predictor)",
+        ),
+        ("one-step error, at the start", millimetres("test/one_step_error_at_start_m"), ""),
+        (
+            "roll-out error, last frame",
+            millimetres("test/rollout_error_final_m"),
+            f"{millimetres('test/rollout_error_final_frozen_m')} frozen",
+        ),
+        (
+            "centre of mass error, largest",
+            millimetres("test/center_of_mass_error_max_m"),
+            f"{millimetres('test/center_of_mass_error_climatology_max_m')} mean of training cases, "
+            f"{millimetres('test/center_of_mass_error_frozen_max_m')} frozen",
+        ),
+    ]
+    if "test/angle_of_repose_deg" in metrics:
+        rows += [
+            (
+                "angle of repose",
+                with_error("test/angle_of_repose_deg", "test/angle_of_repose_standard_error_deg"),
+                with_error("test/angle_of_repose_dem_deg", "test/angle_of_repose_dem_standard_error_deg") + " DEM",
+            ),
+            (
+                "angle of repose error, per case",
+                degrees("test/angle_of_repose_error_deg"),
+                f"{degrees('test/angle_of_repose_error_climatology_deg')} mean of training cases",
+            ),
+        ]
+    own, yade = (metrics.get(f"speed/{name}seconds_per_simulated_second") for name in ("", "yade_"))
+    factor = f", network {yade / own:.3g} times as fast" if _known(own) and _known(yade) and own > 0 else ""
+    cores = metrics.get("speed/yade_cores")
+    rows += [
+        (
+            "overlap, of a diameter",
+            _number(metrics.get("test/mean_overlap_ratio"), 100.0, " %"),
+            _number(metrics.get("test/mean_overlap_ratio_dem"), 100.0, " %") + " DEM",
+        ),
+        ("escaped grains, all cases", str(metrics.get("test/escaped_grains", MISSING)), ""),
+        (
+            "time per simulated second",
+            _number(own, 1.0, " s"),
+            f"{_number(yade, 1.0, ' s')} Yade (dt {_number(metrics.get('speed/yade_dt_s'), 1e6, ' \N{MICRO SIGN}s')}, "
+            f"{cores} core{'' if cores == 1 else 's'}){factor}",
+        ),
+    ]
+    return rows
+
+
+def _grid(rows: list[tuple[str, str, str]]) -> str:
+    widths = [max(len(row[column]) for row in rows) for column in range(3)]
+    lines = [f"{row[0]:<{widths[0]}}  {row[1]:>{widths[1]}}  {row[2]}".rstrip() for row in rows]
+    rule = "\N{BOX DRAWINGS LIGHT HORIZONTAL}" * max(len(line) for line in lines)
+    return "\n".join([rule, lines[0], rule, *lines[1:], rule])
+
+
+def _known(value: Any) -> bool:
+    return isinstance(value, int | float) and value == value
+
+
+def _number(value: Any, factor: float, unit: str) -> str:
+    """Three significant digits, never an exponent where digits will do."""
+    if not _known(value):
+        return MISSING
+    scaled = factor * value
+    if scaled and not 1e-4 <= abs(scaled) < 1e6:
+        return f"{scaled:.2e}{unit}"
+    decimals = 2 if scaled == 0 else max(0, 2 - int(f"{abs(scaled):e}".split("e")[1]))
+    return f"{scaled:.{decimals}f}{unit}"
