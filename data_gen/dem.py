@@ -1,0 +1,120 @@
+"""Starts Yade on one job, follows its progress, and leaves either a complete file or none."""
+
+import json
+import os
+import shutil
+import subprocess
+import tempfile
+from collections import deque
+from collections.abc import Callable, Mapping
+from pathlib import Path
+
+import numpy as np
+from trimesh import Trimesh
+
+from data_gen.initial import Start
+from gns_pyg.config import plain
+from gns_pyg.errors import DataError, DependencyError
+from gns_pyg.scene.scene import Scene
+
+SCRIPT = Path(__file__).with_name("yade_case.py")
+Progress = Callable[[int, int, float], None]  # frames done, frames in all, seconds of stepping so far
+
+
+def run_dem(
+    scene: Scene,
+    meshes: Mapping[str, Trimesh],
+    start: Start,
+    path: Path,
+    case: int = 0,
+    cores: int = 1,
+    n_frames: int | None = None,
+    progress: Progress | None = None,
+) -> None:
+    """Runs Yade from `start` and writes the trajectory to `path`.
+
+    Args:
+        scene: what is simulated; stored in the file as resolved.
+        meshes: mesh of every boundary part in its body frame, m.
+        start: grains and time that the run starts from; any stored frame will do.
+        path: final name of the file; it appears only when the run is complete.
+        case: number stored with the run.
+        cores: threads of Yade.
+        n_frames: frames to store, the start included; the whole scene's when None.
+        progress: called after every stored frame.
+
+    Raises:
+        DependencyError: if Yade is not installed.
+        DataError: if Yade fails; its last lines are shown.
+    """
+    yade = shutil.which("yade")
+    if yade is None:
+        raise DependencyError(
+            "data generation",
+            "no program `yade` on the PATH",
+            "Yade 2022 or newer",
+            "apt-get install yade python3-h5py",
+        )
+    path = path.resolve()
+    clean_stale(path)
+    with tempfile.TemporaryDirectory(prefix="gns_job_") as folder:
+        job = {
+            "scene": plain(scene),
+            "path": str(path),
+            "case": case,
+            "cores": cores,
+            "n_frames": n_frames or scene.n_frames,
+            "time_s": start.time_s,
+            "parent": os.getpid(),
+        }
+        (Path(folder) / "job.json").write_text(json.dumps(job))
+        arrays = {"pos": start.pos, "vel": start.vel, "ang_vel": start.ang_vel}
+        for name, mesh in meshes.items():
+            arrays[f"vertices/{name}"], arrays[f"triangles/{name}"] = np.array(mesh.vertices), np.array(mesh.faces)
+        np.savez(Path(folder) / "arrays.npz", **arrays)
+        command = [yade, "-n", "-x", f"-j{cores}", str(SCRIPT), folder, str(SCRIPT.parents[1])]
+        status, tail = _follow(command, progress or (lambda *_: None))
+    clean_stale(path)
+    if status != 0 or not path.is_file():
+        raise DataError(
+            path,
+            f"Yade ended with status {status}; its last lines:\n    " + "\n    ".join(tail),
+            "a complete run",
+            "see Yade's lines above; an instability shows as values that are not finite: lower scene.dem.dt_s",
+        )
+
+
+def _follow(command: list[str], progress: Progress) -> tuple[int, list[str]]:
+    """Runs `command` to its end; returns its exit status and its last lines of chatter."""
+    tail: deque[str] = deque(maxlen=15)
+    # A session of its own: Ctrl-C reaches this process alone, which then ends Yade.
+    process = subprocess.Popen(
+        command,
+        stdin=subprocess.DEVNULL,
+        stdout=subprocess.PIPE,
+        stderr=subprocess.STDOUT,
+        text=True,
+        errors="replace",
+        start_new_session=True,
+    )
+    try:
+        assert process.stdout is not None  # PIPE was asked for
+        for line in process.stdout:
+            words = line.split()
+            if words[:1] == ["frame"] and len(words) == 4:
+                progress(int(words[1]), int(words[2]), float(words[3]))
+            elif words:
+                tail.append(line.rstrip())
+        return process.wait(), list(tail)
+    finally:
+        if process.poll() is None:
+            process.kill()
+            process.wait()
+
+
+def clean_stale(path: Path) -> None:
+    """Removes unfinished files (`.NAME.PID.part`) of `path` whose process is gone."""
+    for part in path.parent.glob(f".{path.name}.*.part"):
+        pid = part.name.removesuffix(".part").rsplit(".", 1)[-1]
+        if not pid.isdigit() or not Path(f"/proc/{pid}").exists():
+            part.unlink(missing_ok=True)

@@ -1,0 +1,131 @@
+"""How grains start: positions and velocities from one random generator, seeded by (scene.seed, case)."""
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+
+import numpy as np
+from scipy.spatial import cKDTree
+from scipy.spatial.transform import Rotation
+from trimesh import Trimesh
+
+from gns_pyg.errors import GeometryError
+from gns_pyg.scene.mesh import distance, inside, require_closed
+from gns_pyg.scene.scene import Scene
+
+LATTICE_SPACING = 1.002  # of the diameter: touching spheres would start with rounding-error overlaps
+
+
+@dataclass(frozen=True)
+class Start:
+    """The state that a DEM run starts from.
+
+    Attributes:
+        pos: grain centres, m, (n_grains, 3).
+        vel: m/s, (n_grains, 3).
+        ang_vel: rad/s, (n_grains, 3).
+        time_s: scene time; moving walls start in their pose at this time.
+    """
+
+    pos: np.ndarray
+    vel: np.ndarray
+    ang_vel: np.ndarray
+    time_s: float = 0.0
+
+
+def initial_state(scene: Scene, meshes: Mapping[str, Trimesh], case: int) -> Start:
+    """Draws the start of a case; grains do not spin.
+
+    Args:
+        scene: arrangement, number of grains, radius, speed.
+        meshes: mesh of every boundary part; grains lie inside every closed one and clear of all of them.
+        case: number of the case; (scene.seed, case) fixes every random choice.
+
+    Raises:
+        GeometryError: if no part is closed, or the grains do not fit.
+    """
+    generator = np.random.default_rng((scene.seed, case))
+    arrange = {"random": _random, "dense": _dense}[scene.initial.arrangement]
+    pos = arrange(scene, meshes, generator)
+    speed = scene.initial.speed_max_m_s
+    return Start(pos, generator.uniform(-speed, speed, pos.shape), np.zeros_like(pos))
+
+
+def _random(scene: Scene, meshes: Mapping[str, Trimesh], generator: np.random.Generator) -> np.ndarray:
+    """Random sequential addition: uniform candidates, kept one after the other where they overlap nothing."""
+    n, diameter = scene.grains.count, 2 * scene.grains.radius_m
+    lower, upper = _bounds(scene, meshes)
+    cells: dict[tuple[int, ...], list[np.ndarray]] = {}  # centres by cell of one diameter: only neighbours can touch
+    offsets = np.stack(np.meshgrid(*[[-1, 0, 1]] * 3), axis=-1).reshape(-1, 3)
+    kept: list[np.ndarray] = []
+    n_before = -1
+    while len(kept) - n_before > n / 1000:  # random addition saturates, near a volume fraction of 0.38
+        n_before = len(kept)
+        candidates = generator.uniform(lower, upper, (max(n, 1000), 3))
+        for candidate in candidates[_allowed(scene, meshes, candidates)]:
+            cell = np.floor(candidate / diameter).astype(int)
+            near = [other for key in map(tuple, cell + offsets) for other in cells.get(key, ())]
+            if near and ((np.array(near) - candidate) ** 2).sum(axis=1).min() < diameter**2:
+                continue
+            cells.setdefault(tuple(cell), []).append(candidate)
+            kept.append(candidate)
+            if len(kept) == n:
+                return np.array(kept)
+    raise _does_not_fit(scene, f"no room for more than {len(kept)} of {n} grains placed at random")
+
+
+def _dense(scene: Scene, meshes: Mapping[str, Trimesh], generator: np.random.Generator) -> np.ndarray:
+    """The sites of a randomly turned and shifted face-centred cubic lattice nearest to a random allowed point."""
+    n, spacing = scene.grains.count, LATTICE_SPACING * 2 * scene.grains.radius_m
+    lower, upper = _bounds(scene, meshes)
+    centre, reach = (lower + upper) / 2, np.linalg.norm(upper - lower) / 2
+    vectors = spacing / np.sqrt(2) * np.array([[0, 1, 1], [1, 0, 1], [1, 1, 0]])
+    vectors = Rotation.random(random_state=generator).apply(vectors)
+    # A lattice coordinate is a product with a reciprocal vector, so it varies by at most |reciprocal| * reach.
+    steps = np.ceil(np.linalg.norm(np.linalg.inv(vectors), axis=0) * reach).astype(int) + 1
+    sites = np.stack(np.meshgrid(*[np.arange(-k, k + 1) for k in steps], indexing="ij"), axis=-1).reshape(-1, 3)
+    sites = centre + (sites + generator.uniform(0, 1, 3)) @ vectors
+    sites = sites[((sites >= lower) & (sites <= upper)).all(axis=1)]
+    sites = sites[_allowed(scene, meshes, sites)]
+    if len(sites) < n:
+        raise _does_not_fit(scene, f"a close-packed lattice has {len(sites)} sites in the region for {n} grains")
+    anchor = sites[generator.integers(len(sites))]
+    return sites[cKDTree(sites).query(anchor, k=n)[1].reshape(-1)]
+
+
+def _bounds(scene: Scene, meshes: Mapping[str, Trimesh]) -> tuple[np.ndarray, np.ndarray]:
+    """Box (lower, upper), m, that holds all grain centres."""
+    closed = [mesh.bounds for mesh in meshes.values() if mesh.is_watertight]
+    if not closed:
+        for name, mesh in meshes.items():
+            require_closed(mesh, f"scene.boundary.{name}")
+        raise GeometryError("scene.boundary", "no part", "a closed part for the grains to lie in", "add one")
+    radius = scene.grains.radius_m
+    lower = np.max([bounds[0] for bounds in closed], axis=0) + radius
+    upper = np.min([bounds[1] for bounds in closed], axis=0) - radius
+    if scene.initial.z_min_m is not None:
+        lower[2] = max(lower[2], scene.initial.z_min_m)
+    if scene.initial.z_max_m is not None:
+        upper[2] = min(upper[2], scene.initial.z_max_m)
+    if (lower >= upper).any():
+        raise _does_not_fit(scene, f"the region for grain centres is empty (from {lower} to {upper} m)")
+    return lower, upper
+
+
+def _allowed(scene: Scene, meshes: Mapping[str, Trimesh], pos: np.ndarray) -> np.ndarray:
+    """Which centres lie inside every closed part and a radius clear of every wall, bool (n,)."""
+    allowed = np.ones(len(pos), bool)
+    for mesh in meshes.values():
+        if mesh.is_watertight:
+            allowed[allowed] = inside(mesh, pos[allowed])
+        allowed[allowed] = distance(mesh, pos[allowed]) >= scene.grains.radius_m
+    return allowed
+
+
+def _does_not_fit(scene: Scene, found: str) -> GeometryError:
+    return GeometryError(
+        f"scene.initial of {scene.name}",
+        found,
+        "room for all grains without overlap",
+        "lower scene.grains.count or scene.grains.radius_m, widen scene.initial.z_min_m/z_max_m, "
+        "or set scene.initial.arrangement=dense",
+    )
