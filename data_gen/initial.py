@@ -57,7 +57,7 @@ def _random(scene: Scene, meshes: Mapping[str, Trimesh], generator: np.random.Ge
     cells: dict[tuple[int, ...], list[np.ndarray]] = {}  # centres by cell of one diameter: only neighbours can touch
     offsets = np.stack(np.meshgrid(*[[-1, 0, 1]] * 3), axis=-1).reshape(-1, 3)
     kept: list[np.ndarray] = []
-    n_before = -1
+    n_before = -n
     while len(kept) - n_before > n / 1000:  # random addition saturates, near a volume fraction of 0.38
         n_before = len(kept)
         candidates = generator.uniform(lower, upper, (max(n, 1000), 3))
