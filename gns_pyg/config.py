@@ -1,12 +1,15 @@
 """From plain config values to typed records: every key known, every type checked, one clear error."""
 
 from collections.abc import Mapping
+from pathlib import Path
 from typing import Any, TypeVar
 
 from omegaconf import OmegaConf
 from omegaconf.errors import OmegaConfBaseException
 
 from gns_pyg.errors import ConfigError
+
+CONF = str(Path(__file__).resolve().parent / "conf")
 
 Record = TypeVar("Record")
 
@@ -49,3 +52,10 @@ def require(condition: bool, where: str, found: object, expected: str, remedy: s
     """Raises ConfigError unless `condition` holds."""
     if not condition:
         raise ConfigError(where, str(found), expected, remedy)
+
+
+def flat(values: Any, prefix: str = "") -> dict[str, Any]:
+    """Nested mappings as one level of dotted keys."""
+    if not isinstance(values, Mapping):
+        return {prefix: values}
+    return {key: leaf for name in values for key, leaf in flat(values[name], f"{prefix}.{name}".lstrip(".")).items()}

@@ -10,7 +10,7 @@ from typing import Any
 import pytorch_lightning as pl
 from torch.utils.data import DataLoader
 
-from gns_pyg.config import require
+from gns_pyg.config import flat, require
 from gns_pyg.data.trajectory import Trajectory
 from gns_pyg.data.windows import UpdateSampler, Windows
 from gns_pyg.errors import DataError
@@ -96,13 +96,21 @@ def split(scene: Scene, config: DataConfig) -> Split:
             "at least one left to train on",
             "generate more cases, or lower data.test_fraction or data.val_cases",
         )
-    return Split(trajectories[:n_train], trajectories[n_train : n_train + config.val_cases], trajectories[-n_test:] if n_test else [])
+    return Split(
+        trajectories[:n_train],
+        trajectories[n_train : n_train + config.val_cases],
+        trajectories[-n_test:] if n_test else [],
+    )
 
 
 def check_same_scene(trajectory: Trajectory, scene: Scene) -> None:
     """Raises DataError, naming every difference, if a case was not made from what `scene` describes."""
     ours, theirs = _physics(asdict(scene)), _physics(trajectory.scene)
-    different = [f"{key} = {theirs.get(key)!r} (scene: {ours.get(key)!r})" for key in sorted(ours | theirs) if ours.get(key) != theirs.get(key)]
+    different = [
+        f"{key} = {theirs.get(key)!r} (scene: {ours.get(key)!r})"
+        for key in sorted(ours | theirs)
+        if ours.get(key) != theirs.get(key)
+    ]
     if different:
         raise DataError(
             trajectory.path,
@@ -114,17 +122,10 @@ def check_same_scene(trajectory: Trajectory, scene: Scene) -> None:
 
 def _physics(scene: Mapping[str, Any]) -> dict[str, Any]:
     """The part of a scene that decides how grains move, flattened to dotted keys."""
-    flat: dict[str, Any] = {}
-
-    def walk(prefix: str, value: Any) -> None:
-        if isinstance(value, Mapping):
-            for key, inner in value.items():
-                walk(f"{prefix}.{key}" if prefix else key, inner)
-        else:
-            flat[prefix] = value
-
-    walk("", {key: scene[key] for key in ("gravity_m_s2", "damping", "damping_on_gravity", "frame_dt_s", "grains", "boundary")})
-    return {key: value for key, value in flat.items() if not key.endswith(".points")}
+    decisive = ("gravity_m_s2", "damping", "damping_on_gravity", "frame_dt_s", "grains", "boundary")
+    return {
+        key: v for key, v in flat({k: scene[k] for k in decisive if k in scene}).items() if not key.endswith(".points")
+    }
 
 
 class DataModule(pl.LightningDataModule):

@@ -7,6 +7,7 @@ H5MD_VERSION = (1, 1)
 GRAINS = "particles/grains"
 UNITS = {"position": "m", "velocity": "m s-1", "angular_velocity": "rad s-1"}
 FIXED_UNITS = {"radius": "m", "mass": "kg"}
+OPTIONAL = {"gns_pyg": {"angular_velocity"}}  # by creator: a model's state need not hold rotation; DEM's does
 RUN_KEYS = ("wall_clock_s", "cores", "steps", "dt_s", "creator", "creator_version")
 
 
@@ -24,7 +25,10 @@ def violations(file: h5py.File) -> list[str]:
     if "box" not in grains:
         wrong.append(f"/{GRAINS}/box: group missing")
     n_frames = n_grains = None
+    creator = _text(file["parameters"].attrs.get("creator")) if "parameters" in file else None
     for name, unit in UNITS.items():
+        if name not in grains and name in OPTIONAL.get(creator or "", ()):
+            continue
         if f"{name}/value" not in grains or f"{name}/time" not in grains:
             wrong.append(f"/{GRAINS}/{name}: `value` or `time` missing")
             continue

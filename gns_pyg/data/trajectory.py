@@ -69,7 +69,22 @@ class Trajectory:
         """Returns frames [start, stop) of `field` (position, velocity, angular_velocity), float64 (n, n_grains, 3)."""
         if self._file is None:  # opened on first use, so that data-loader workers hold handles of their own
             self._file = h5py.File(self.path, "r")
+        if field not in self._file[GRAINS]:
+            raise DataError(self.path, f"no {field}", f"the field {field}", "use a DEM run, which stores all fields")
         return self._file[GRAINS][field]["value"][start:stop].astype(np.float64)
+
+    @property
+    def boundary(self) -> dict[str, dict[str, Any]]:
+        """Part name -> {"vertices": (n, 3) m, "triangles": (m, 3), "motion": dict}, at t = 0."""
+        with h5py.File(self.path, "r") as file:
+            return {
+                name: {
+                    "vertices": part["vertices"][:],
+                    "triangles": part["triangles"][:],
+                    "motion": json.loads(part.attrs["motion"]),
+                }
+                for name, part in file.get("boundary", {}).items()
+            }
 
     @property
     def frame_dt_s(self) -> float:
@@ -94,7 +109,8 @@ class TrajectoryWriter:
         scene: the scene as resolved (plain dict).
         radius, mass: (n_grains,), m and kg.
         boundary: part name -> {"vertices": (n, 3) m, "triangles": (m, 3), "motion": dict}.
-        decimals: digits kept after the point, per field (HDF5's scale-offset filter), SI units.
+        decimals: digits kept after the point (HDF5's scale-offset filter, SI units) of every field to be written:
+            all three for a DEM run; a model whose state has no rotation leaves `angular_velocity` out.
     """
 
     def __init__(
@@ -121,9 +137,11 @@ class TrajectoryWriter:
         for name, values in (("radius", radius), ("mass", mass)):
             grains.create_dataset(name, data=np.asarray(values, np.float64)).attrs["unit"] = FIXED_UNITS[name]
         grains.create_dataset("species", data=np.zeros(len(radius), np.int32))
-        for name, unit in UNITS.items():
-            self._create_field(grains.create_group(name), unit, decimals[name])
-        for name in list(UNITS)[1:]:  # H5MD: elements sampled together share step and time
+        self._pending: dict[str, list[np.ndarray]] = {name: [] for name in decimals}
+        self._fields = [name for name in UNITS if name in decimals]
+        for name in self._fields:
+            self._create_field(grains.create_group(name), UNITS[name], decimals[name])
+        for name in self._fields[1:]:  # H5MD: elements sampled together share step and time
             for shared in ("step", "time"):
                 grains[name][shared] = grains["position"][shared]
         for name, part in boundary.items():
@@ -143,21 +161,22 @@ class TrajectoryWriter:
             np.float64,
             maxshape=(None, self._n_grains, 3),
             chunks=(CHUNK_FRAMES, self._n_grains, 3),
-            scaleoffset=decimals,
-            shuffle=True,
+            scaleoffset=decimals,  # packs bits, so that shuffling bytes afterwards would only hide repeats from gzip
             compression="gzip",
             compression_opts=6,
         )
         value.attrs["unit"] = unit
-        self._pending: dict[str, list[np.ndarray]] = {name: [] for name in UNITS}
 
-    def append(self, step: int, time_s: float, pos: np.ndarray, vel: np.ndarray, ang_vel: np.ndarray) -> None:
+    def append(
+        self, step: int, time_s: float, pos: np.ndarray, vel: np.ndarray, ang_vel: np.ndarray | None = None
+    ) -> None:
         """Adds a frame: grain centres (n_grains, 3) m, velocities m/s, angular velocities rad/s.
 
         Raises:
             DataError: if a value is not finite; nothing of this frame is written.
         """
-        frame = dict(zip(UNITS, (pos, vel, ang_vel), strict=True))
+        given = dict(zip(UNITS, (pos, vel, ang_vel), strict=True))
+        frame = {name: np.array(given[name], np.float64) for name in self._fields}
         for name, values in frame.items():
             if not np.isfinite(values).all():
                 grain = int(np.argwhere(~np.isfinite(values).all(axis=1))[0, 0])
@@ -167,7 +186,8 @@ class TrajectoryWriter:
                     "finite values",
                     "lower the time step",
                 )
-            self._pending[name].append(np.array(values, np.float64))
+        for name, values in frame.items():
+            self._pending[name].append(values)
         grains = self._file[GRAINS]
         for name, value in (("step", step), ("time", time_s)):
             grains["position"][name].resize((self._n_frames + 1,))

@@ -43,13 +43,13 @@ class Simulator(nn.Module):
         self.register_buffer("scale", torch.as_tensor(scales, dtype=torch.float32), persistent=False)
         self._indices: dict[str, tuple[torch.device, object]] = {}
 
-        shared = dict(
-            n_out=3 * self.integrator.n_groups,
-            hidden=config.hidden,
-            layers=config.layers,
-            mlp_layers=config.mlp_layers,
-            skip=config.skip,
-        )
+        shared = {
+            "n_out": 3 * self.integrator.n_groups,
+            "hidden": config.hidden,
+            "layers": config.layers,
+            "mlp_layers": config.mlp_layers,
+            "skip": config.skip,
+        }
         n_position = 3 * config.absolute_position
         n_grain = 3 + 3 * (config.state == "full") + n_position
         n_edge = features.n_grain_edge_features(config.contact_features)
@@ -70,11 +70,11 @@ class Simulator(nn.Module):
         walls = self.walls(state)
         graph = self.graph(state)
         grain_features = self._grain_features(state)
-        options = dict(
-            velocity_m_s=self.statistics.velocity_m_s,
-            dt_s=self.scene.frame_dt_s,
-            contact=self.config.contact_features,
-        )
+        options = {
+            "velocity_m_s": self.statistics.velocity_m_s,
+            "dt_s": self.scene.frame_dt_s,
+            "contact": self.config.contact_features,
+        }
         edge_features = features.grain_edges(state, graph, **options).to(self.scale.dtype)
         total = self.grain_network(None, grain_features, edge_features, graph.grain_edges)
         if self.wall_network is not None:
@@ -108,7 +108,11 @@ class Simulator(nn.Module):
         radius_m = self.scene.grains.radius_m
         index = search.build(state.pos, state.batch)
         reach = self.config.cutoff_grain_radii * radius_m
-        grain_edges = index(state.pos, state.batch, reach) if self.config.self_loops else pairs(index, state.pos, state.batch, reach)
+        grain_edges = (
+            index(state.pos, state.batch, reach)
+            if self.config.self_loops
+            else pairs(index, state.pos, state.batch, reach)
+        )
         found, offset, one_graph = [], 0, torch.zeros_like(state.batch)
         n_points = sum(len(self.get_buffer(f"wall_pos_{name}")) for name in self.scene.boundary)
         for name, part in self.scene.boundary.items():

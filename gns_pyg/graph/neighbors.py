@@ -114,7 +114,9 @@ def _grid(points: Tensor, point_batch: Tensor) -> Index:
             first = torch.searchsorted(key, wanted_key)
             count = torch.searchsorted(key, wanted_key, right=True) - first
             asking = torch.repeat_interleave(torch.arange(len(query), device=query.device), count)
-            place = torch.arange(len(asking), device=query.device) - torch.repeat_interleave(count.cumsum(0) - count, count)
+            place = torch.arange(len(asking), device=query.device) - torch.repeat_interleave(
+                count.cumsum(0) - count, count
+            )
             point = order[first[asking] + place]
             same_cell = (cell[point] == wanted[asking]).all(1)  # two cells may share a key
             near = (points[point] - query[asking]).square().sum(1) <= radius**2

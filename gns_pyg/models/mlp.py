@@ -1,5 +1,7 @@
 """The one kind of small network everything else is made of."""
 
+import itertools
+
 from torch import nn
 
 
@@ -10,7 +12,7 @@ def mlp(n_in: int, hidden: int, n_out: int, layers: int, *, layer_norm: bool = F
     """
     widths = [n_in, *[hidden] * (layers - 1), n_out]
     modules: list[nn.Module] = []
-    for wide, narrow in zip(widths[:-1], widths[1:], strict=True):
+    for wide, narrow in itertools.pairwise(widths):
         modules += [nn.Linear(wide, narrow), nn.ReLU()]
     modules.pop()
     return nn.Sequential(*modules, *([nn.LayerNorm(n_out)] if layer_norm else []))

@@ -1,0 +1,9 @@
+"""python evaluate.py bundle=runs/.../bundle"""
+
+import hydra
+
+from gns_pyg import run
+from gns_pyg.config import CONF
+
+if __name__ == "__main__":
+    hydra.main(config_path=CONF, config_name="evaluate", version_base="1.3")(run.entry(run.evaluate))()

@@ -1,0 +1,46 @@
+"""How a simulator is trained; conf/training/*.yaml are its files."""
+
+from dataclasses import dataclass
+
+from omegaconf import MISSING
+
+from gns_pyg.config import require
+
+
+@dataclass
+class TrainingConfig:
+    """One run of the optimiser.
+
+    Attributes:
+        updates: optimiser steps.
+        batch_size: windows per update.
+        seed: of initialisation, shuffling, noise and unrolling.
+        lr_start: Adam's learning rate at the start; it is halved `halvings` times, at equal intervals.
+        halvings: see `lr_start`; 5 takes 1e-4 to 3.125e-6, the paper's values.
+        noise_radii: standard deviation of the noise on input positions, in grain radii.
+        noise_velocity: standard deviation of the noise on input velocities (and spins), in their scales.
+        unroll: half of the updates start from up to this many of the model's own steps; 0 is one-step training.
+        unroll_from: share of the updates after which unrolling begins.
+        gradient_clip: largest gradient norm; 0 is no limit.
+    """
+
+    updates: int = MISSING
+    batch_size: int = MISSING
+    seed: int = MISSING
+    lr_start: float = MISSING
+    halvings: int = MISSING
+    noise_radii: float = MISSING
+    noise_velocity: float = MISSING
+    unroll: int = MISSING
+    unroll_from: float = MISSING
+    gradient_clip: float = MISSING
+
+    def __post_init__(self) -> None:
+        for key in ("updates", "batch_size", "lr_start"):
+            value = getattr(self, key)
+            require(value > 0, f"training.{key}", value, "above 0", f"set training.{key} above 0")
+
+    @property
+    def window_length(self) -> int:
+        """Frames a training window needs: one before, the start, the model's own steps, the target."""
+        return 3 + self.unroll

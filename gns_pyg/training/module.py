@@ -1,0 +1,77 @@
+"""What Lightning drives: one update of a simulator."""
+
+from dataclasses import replace
+from typing import Any
+
+import pytorch_lightning as pl
+import torch
+from torch import Tensor
+
+from gns_pyg.dynamics.simulator import Simulator
+from gns_pyg.errors import NumericalError
+from gns_pyg.state import State, Window
+from gns_pyg.training.config import TrainingConfig
+
+
+class TrainingModule(pl.LightningModule):
+    """One-step training, on perturbed frames and on the simulator's own steps.
+
+    The loss is the mean square of the scaled correction's error: for position-only states the paper's (12) up to a
+    constant factor. Noise and unrolling are drawn from the seed and the update's number, so a resumed run
+    repeats none and skips none.
+    """
+
+    def __init__(self, simulator: Simulator, config: TrainingConfig) -> None:
+        super().__init__()
+        self.simulator, self.config = simulator, config
+
+    def training_step(self, window: Window, _: int) -> Tensor:
+        random = torch.Generator().manual_seed(self.config.seed * 1_000_003 + self.global_step)
+        state, frame = self.simulator.integrator.read(window, 1), 1
+        state = perturb(state, self.config, self.simulator, random)
+        with torch.no_grad():
+            for _ in range(self._own_steps(random)):
+                state, frame = self.simulator(state), frame + 1
+        target = self.simulator.target(state, self.simulator.integrator.read(window, frame + 1))
+        loss = (self.simulator.correction(state) - target).square().mean()
+        if not torch.isfinite(loss):
+            raise NumericalError(
+                f"training update {self.global_step}",
+                f"loss {loss.item()}",
+                "a finite loss",
+                "lower training.lr_start or training.unroll; the last checkpoint is in the run folder",
+            )
+        self.log("train/loss", loss, batch_size=state.n_graphs)
+        return loss
+
+    def _own_steps(self, random: torch.Generator) -> int:
+        """0 for half of the updates, else 1 to `unroll`."""
+        steps = int(torch.randint(1, self.config.unroll + 1, (), generator=random)) if self.config.unroll else 0
+        unrolls = torch.rand((), generator=random) < 0.5
+        started = self.global_step >= self.config.unroll_from * self.config.updates
+        return steps if unrolls and started else 0
+
+    def configure_optimizers(self) -> dict[str, Any]:
+        optimizer = torch.optim.Adam(self.simulator.parameters(), lr=self.config.lr_start)
+        stretch = self.config.updates / (self.config.halvings + 1)
+        schedule = torch.optim.lr_scheduler.LambdaLR(
+            optimizer, lambda update: 0.5 ** min(int(update / stretch), self.config.halvings)
+        )
+        return {"optimizer": optimizer, "lr_scheduler": {"scheduler": schedule, "interval": "step"}}
+
+
+def perturb(state: State, config: TrainingConfig, simulator: Simulator, random: torch.Generator) -> State:
+    """A copy of `state` with Gaussian noise on positions, velocities and spins; `state` itself stays as it is."""
+
+    def noise(like: Tensor) -> Tensor:
+        return torch.randn(like.shape, dtype=like.dtype, generator=random).to(like.device)
+
+    scale = simulator.statistics
+    return replace(
+        state,
+        pos=state.pos + config.noise_radii * state.radius[:, None] * noise(state.pos),
+        vel=state.vel + config.noise_velocity * scale.velocity_m_s * noise(state.vel),
+        ang_vel=None
+        if state.ang_vel is None
+        else state.ang_vel + config.noise_velocity * scale.spin_rad_s * noise(state.ang_vel),
+    )

@@ -1,0 +1,59 @@
+"""Small untrained simulators and random states for the tests."""
+
+from typing import Any
+
+import numpy as np
+import torch
+from gns_pyg.scene.boundary_points import sample_boundary
+
+from gns_pyg.dynamics.model_config import ModelConfig
+from gns_pyg.dynamics.simulator import Simulator
+from gns_pyg.models.statistics import Statistics
+from gns_pyg.scene.scene import Scene
+from gns_pyg.state import State
+
+MODEL: dict[str, Any] = {
+    "state": "full",
+    "residual": True,
+    "absolute_position": False,
+    "contact_features": True,
+    "self_loops": False,
+    "skip": True,
+    "hidden": 16,
+    "layers": 2,
+    "mlp_layers": 2,
+    "cutoff_grain_radii": 3.0,
+    "cutoff_wall_radii": 3.0,
+}
+PAPER = {
+    "state": "differences",
+    "residual": False,
+    "absolute_position": True,
+    "contact_features": False,
+    "self_loops": True,
+    "skip": False,
+}
+STATISTICS = dict(velocity_m_s=0.5, spin_rad_s=20.0, position_mean_m=[0.0, 0.0, 0.1], position_std_m=0.1)
+
+
+def simulator(scene: Scene, seed: int = 0, dtype: torch.dtype = torch.float32, **changes: Any) -> Simulator:
+    """An untrained simulator of `scene`; `changes` replace keys of MODEL. In float64 every weight is float64."""
+    config = ModelConfig(**(MODEL | changes))
+    groups = 1 + ("differences", "velocity", "full").index(config.state)
+    statistics = Statistics(**STATISTICS, correction=[0.1, 0.2, 10.0][:groups])
+    boundary = {name: sample_boundary(name, part, 0) for name, part in scene.boundary.items()}
+    torch.manual_seed(seed)
+    return Simulator(scene, config, boundary, statistics).to(dtype).eval()
+
+
+def state_in_box(n_per_graph: list[int], seed: int = 0, half_m: float = 0.06, spin: bool = True) -> State:
+    """Random grains of 1 cm radius in a cube around the origin, one cube per graph; overlaps are allowed."""
+    n, random = sum(n_per_graph), np.random.default_rng(seed)
+    return State(
+        pos=torch.from_numpy(random.uniform(-half_m, half_m, (n, 3))),
+        vel=torch.from_numpy(random.normal(0, 0.5, (n, 3))),
+        ang_vel=torch.from_numpy(random.normal(0, 20, (n, 3))) if spin else None,
+        radius=torch.full((n,), 0.01, dtype=torch.float64),
+        time_s=torch.linspace(0.1, 0.4, len(n_per_graph), dtype=torch.float64),
+        batch=torch.repeat_interleave(torch.arange(len(n_per_graph)), torch.tensor(n_per_graph)),
+    )
