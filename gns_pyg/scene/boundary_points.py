@@ -1,0 +1,107 @@
+"""Poisson-disk points on a boundary part: evenly spread, exact in number, with normals to the grains' side."""
+
+import heapq
+from dataclasses import dataclass
+
+import numpy as np
+from scipy.spatial import cKDTree
+from trimesh import Trimesh
+
+from gns_pyg.config import require
+
+CANDIDATES_PER_POINT = 5
+ALPHA, BETA, GAMMA = 8, 0.65, 1.5  # Yuksel's choices: the weight's exponent and its limit at small distances
+
+LARGEST_HOLE = 1.12  # farthest place from any point, in spacings of the densest packing; measured on all scenes
+
+
+@dataclass(frozen=True)
+class BoundaryPoints:
+    """Points of one part in its body frame (its pose at t = 0).
+
+    Attributes:
+        pos: m, (n, 3).
+        normal: unit vectors to the grains' side, (n, 3): inwards on a closed part, the winding side of an open one.
+    """
+
+    pos: np.ndarray
+    normal: np.ndarray
+
+
+def sample_boundary_points(mesh: Trimesh, n: int, seed: int = 0) -> BoundaryPoints:
+    """Spreads exactly `n` points over a mesh by weighted sample elimination.
+
+    Source: C. Yuksel, Sample elimination for generating Poisson disk sample sets, Computer Graphics Forum 34 (2015).
+
+    Args:
+        mesh: part as `build_mesh` makes it, m.
+        n: number of points.
+        seed: the same mesh, number and seed give the same points.
+
+    Raises:
+        ConfigError: for fewer than one point.
+    """
+    require(n >= 1, "scene.boundary.<part>.points", n, "at least 1", "see docs/assumptions.md for a sufficient number")
+    pos, triangle = _uniform(mesh, CANDIDATES_PER_POINT * n, np.random.default_rng(seed))
+    kept = _eliminate(pos, n, mesh.area)
+    side = -1.0 if mesh.is_watertight else 1.0
+    return BoundaryPoints(pos[kept], side * mesh.face_normals[triangle[kept]])
+
+
+def sufficient_points(mesh: Trimesh, radius_m: float, cutoff_radius_m: float) -> int:
+    """The number of points with which a grain that touches the wall anywhere sees at least one.
+
+    Args:
+        mesh: part, m.
+        radius_m: grain radius.
+        cutoff_radius_m: how far a grain's centre sees boundary points.
+
+    Raises:
+        ConfigError: if a touching grain's centre is out of reach of the point that it touches.
+    """
+    where = "cutoff_radius_m"
+    require(cutoff_radius_m > radius_m, where, cutoff_radius_m, f"above the grain radius {radius_m}", "raise it")
+    spacing = np.sqrt(cutoff_radius_m**2 - radius_m**2) / LARGEST_HOLE
+    return int(np.ceil(2 * mesh.area / (np.sqrt(3) * spacing**2)))
+
+
+def _uniform(mesh: Trimesh, n: int, generator: np.random.Generator) -> tuple[np.ndarray, np.ndarray]:
+    """(n, 3) points uniform by area, m, and the triangle of each."""
+    chosen = generator.choice(len(mesh.faces), n, p=mesh.area_faces / mesh.area_faces.sum())
+    weights = generator.uniform(size=(n, 2))
+    beyond = weights.sum(axis=1) > 1  # the parallelogram's other half, mirrored back
+    weights[beyond] = 1 - weights[beyond]
+    corners = np.asarray(mesh.triangles)[chosen]
+    return corners[:, 0] + np.einsum("ne,nek->nk", weights, corners[:, 1:] - corners[:, :1]), chosen
+
+
+def _eliminate(pos: np.ndarray, n: int, area: float) -> np.ndarray:
+    """Indices (n,) of the points that stay when the most crowded one is removed again and again."""
+    largest = np.sqrt(area / (2 * np.sqrt(3) * n))  # disk radius of the densest packing of n disks
+    smallest = largest * (1 - (n / len(pos)) ** GAMMA) * BETA
+    pairs = cKDTree(pos).query_pairs(2 * largest, output_type="ndarray")
+    apart = np.linalg.norm(pos[pairs[:, 0]] - pos[pairs[:, 1]], axis=1)
+    weight_of_pair = (1 - np.clip(apart, 2 * smallest, 2 * largest) / (2 * largest)) ** ALPHA
+
+    ends = np.concatenate([pairs, pairs[:, ::-1]])
+    order = np.argsort(ends[:, 0], kind="stable")
+    neighbours, pair_weights = ends[order, 1].tolist(), np.tile(weight_of_pair, 2)[order].tolist()
+    first = np.searchsorted(ends[order, 0], np.arange(len(pos) + 1)).tolist()
+    weight = np.bincount(ends[:, 0], np.tile(weight_of_pair, 2), minlength=len(pos)).tolist()
+
+    alive = [True] * len(pos)
+    heap = [(-value, index) for index, value in enumerate(weight)]
+    heapq.heapify(heap)
+    remaining = len(pos)
+    while remaining > n:
+        value, index = heapq.heappop(heap)
+        if not alive[index] or -value != weight[index]:
+            continue  # an entry from before a neighbour went; its successor is in the heap
+        alive[index] = False
+        remaining -= 1
+        for k in range(first[index], first[index + 1]):
+            other = neighbours[k]
+            if alive[other]:
+                weight[other] -= pair_weights[k]
+                heapq.heappush(heap, (-weight[other], other))
+    return np.flatnonzero(alive)
