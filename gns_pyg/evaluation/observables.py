@@ -15,9 +15,9 @@ from gns_pyg.scene.mesh import build_mesh, distance, inside
 from gns_pyg.scene.motion import to_body
 from gns_pyg.scene.scene import Scene
 
-BIN_DIAMETERS = 2.0  # width of a surface bin
+CELL_DIAMETERS = 1.5  # edge of the surface's cells; 1 to 2 read the same angle, 1.5 with the least scatter
 BED_GAP_DIAMETERS = 1.25  # grains nearer than this belong together: the paper's cutoff, 2.5 radii
-CENTRAL_SHARE = 0.6  # of the bed's width across the drum; the surface bends towards the wall beyond it
+CENTRAL_SHARE = 0.75  # of the bed's width across the drum; the surface bends towards the mantle beyond it
 
 
 def center_of_mass(pos: np.ndarray, mass: np.ndarray) -> np.ndarray:
@@ -47,22 +47,23 @@ def angle_of_repose(pos: np.ndarray, scene: Scene) -> np.ndarray:
     """Angle of the bed's free surface against the horizontal, per frame.
 
     Only grains of the bed count: the largest cluster of grains nearer than 1.25 diameters to each other, so that a
-    grain in flight or an escaped one does not pose as surface. The coordinate along the surface is divided into bins
-    of about two grain diameters (at least four bins), the highest grain of each bin is the surface (the radius that
-    lies between its centre and its top is the same everywhere and leaves the slope as it is), and a least-squares
-    line through these grains gives the angle.
+    grain in flight or an escaped one does not pose as surface. The horizontal plane is divided into square cells of
+    1.5 grain diameters, the highest grain of each cell is the surface (the radius that lies between its centre and
+    its top is the same everywhere and leaves the slope as it is), and a least-squares line through the heights of
+    these grains gives the angle. Cells of equal area matter: the highest of many grains is higher than the highest
+    of few, so that whole annuli of a heap, which grow outwards, would read several degrees too flat.
 
-    `plane` (a drum): the coordinate is the horizontal one across the axis; the middle half of the bed's grains along
-    the axis and the central 60 % of the bed's width are read (away from end caps and mantle); the angle is unsigned.
-    `radial` (a heap): the coordinate is the distance from the vertical axis through the middle of the boundary; the
-    angle is positive where the heap is highest in the middle, negative for a crater.
+    `plane` (a drum): height against the horizontal coordinate across the axis; the middle half of the bed's grains
+    along the axis and the central 75 % of the bed's width are read (away from end caps and mantle); unsigned.
+    `radial` (a heap): height against distance from the vertical axis through the middle of the boundary; positive
+    where the heap is highest in the middle, negative for a crater.
 
     Args:
         pos: m, (n_frames, n_grains, 3).
         scene: gives `angle_of_repose`, gravity and the grain radius.
 
     Returns:
-        (n_frames,), degrees; nan where fewer than three bins hold a grain.
+        (n_frames,), degrees; nan where the surface's grains span less than two cells.
 
     Raises:
         ConfigError: if the scene defines no angle of repose, of an unknown kind, or an axis along gravity.
@@ -141,33 +142,33 @@ def _plane_angle(bed: np.ndarray, axis: np.ndarray, across: np.ndarray, up: np.n
     low, high = np.quantile(along, [0.25, 0.75])
     slab = bed[(along >= low) & (along <= high)]
     coordinate = slab @ across
-    edge, width = coordinate.min(), np.ptp(coordinate)
-    margin = 0.5 * (1 - CENTRAL_SHARE) * width
-    slope = _surface_slope(coordinate, slab @ up, edge + margin, edge + width - margin, radius)
-    return float(np.degrees(np.arctan(abs(slope))))
+    middle, half = (coordinate.min() + coordinate.max()) / 2, CENTRAL_SHARE * np.ptp(coordinate) / 2
+    central = slab[np.abs(coordinate - middle) <= half]
+    tops = central[_surface(central @ across, central @ axis, central @ up, radius)]
+    return float(np.degrees(np.arctan(abs(_slope(tops @ across, tops @ up, radius)))))
 
 
 def _radial_angle(bed: np.ndarray, middle: np.ndarray, up: np.ndarray, radius: float) -> float:
-    height = (bed - middle) @ up
-    distance = np.linalg.norm(bed - middle - height[:, None] * up, axis=1)
-    slope = _surface_slope(distance, height, 0.0, distance.max(), radius)
-    return float(np.degrees(np.arctan(-slope)))
+    east = np.cross(up, np.eye(3)[np.abs(up).argmin()])
+    east /= np.linalg.norm(east)
+    x, y, height = (bed - middle) @ east, (bed - middle) @ np.cross(up, east), (bed - middle) @ up
+    top = _surface(x, y, height, radius)
+    return float(np.degrees(np.arctan(-_slope(np.hypot(x, y)[top], height[top], radius))))
 
 
-def _surface_slope(coordinate: np.ndarray, height: np.ndarray, low: float, high: float, radius: float) -> float:
-    """Slope of the line through the highest grain of each bin between `low` and `high`; nan below three bins."""
-    n_bins = max(4, round((high - low) / (BIN_DIAMETERS * 2 * radius)))
-    edges = np.linspace(low, high, n_bins + 1)
-    bin_of = np.searchsorted(edges, coordinate, side="right") - 1
-    bin_of[coordinate == high] = n_bins - 1
-    tops = []
-    for index in range(n_bins):
-        members = np.flatnonzero(bin_of == index)
-        if len(members):
-            tops.append(members[height[members].argmax()])
-    if len(tops) < 3 or np.ptp(coordinate[tops]) == 0:
+def _surface(x: np.ndarray, y: np.ndarray, height: np.ndarray, radius: float) -> np.ndarray:
+    """Indices of the highest grain of each cell of the horizontal plane (x, y)."""
+    cells = np.floor(np.stack([x, y], axis=1) / (CELL_DIAMETERS * 2 * radius))
+    cell = np.unique(cells, axis=0, return_inverse=True)[1].reshape(-1)
+    order = np.lexsort((height, cell))
+    return order[np.append(np.diff(cell[order]) > 0, True)]
+
+
+def _slope(coordinate: np.ndarray, height: np.ndarray, radius: float) -> float:
+    """Slope of the least-squares line; nan where the points span too little to tell."""
+    if len(coordinate) < 3 or np.ptp(coordinate) < 2 * CELL_DIAMETERS * 2 * radius:
         return float("nan")
-    return float(np.polyfit(coordinate[tops], height[tops], 1)[0])
+    return float(np.polyfit(coordinate, height, 1)[0])
 
 
 def _boundary_middle(scene: Scene) -> np.ndarray:

@@ -1,11 +1,13 @@
 """Figures of an evaluation, each as PNG and SVG. Colours are Okabe and Ito's, which colour-blind readers tell apart;
 DEM, network and climatology also differ by line style, so that a print in black and white reads too."""
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from pathlib import Path
+from typing import Literal
 
 import numpy as np
 import torch
+from matplotlib.artist import Artist
 from matplotlib.axes import Axes
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.collections import EllipseCollection, LineCollection
@@ -20,38 +22,44 @@ from gns_pyg.scene.mesh import build_mesh
 from gns_pyg.scene.motion import to_world
 from gns_pyg.scene.scene import Scene
 
+Style = Literal["-", "--", ":"]
+
 BLUE, VERMILION, GREEN, PURPLE, ORANGE, SKY = "#0072B2", "#D55E00", "#009E73", "#CC79A7", "#E69F00", "#56B4E9"
 CASE_COLORS = (BLUE, VERMILION, GREEN, PURPLE, ORANGE, SKY)
-DEM, NETWORK, CLIMATOLOGY = "-", "--", ":"
+DEM: Style = "-"
+NETWORK: Style = "--"
+CLIMATOLOGY: Style = ":"
 PAPER_FINAL_ERROR_MM = {"hopper": 93.9, "drum": 79.0}  # sections 5.1: hopper at 2 s, drum at 3 s
 SPEED_QUANTILE = 0.99  # the colour scale ends here, so that one fast grain does not darken all others
 
 
 def write_plots(evaluation: Evaluation, scene: Scene, folder: str | Path) -> list[Path]:
-    """Draws every figure that the evaluation has data for.
-
-    Returns:
-        The files written, per figure PNG then SVG: rollout_error, one_step_error, center_of_mass, angle_of_repose
-        (where the scene defines it), overlap, snapshots.
-    """
+    """Writes every figure of `draw` into `folder`; returns the files, per figure PNG then SVG."""
     folder = Path(folder)
     folder.mkdir(parents=True, exist_ok=True)
+    files = []
+    for name, figure in draw(evaluation, scene).items():
+        for ending in ("png", "svg"):
+            path = folder / f"{name}.{ending}"
+            figure.savefig(path, dpi=150)
+            files.append(path)
+    return files
+
+
+def draw(evaluation: Evaluation, scene: Scene) -> dict[str, Figure]:
+    """Draws every figure that the evaluation has data for, by name."""
     figures = {
         "rollout_error": rollout_error(evaluation, scene),
         "one_step_error": one_step_error(evaluation, scene),
         "center_of_mass": center_of_mass_height(evaluation, scene),
+        "overlap": overlap(evaluation, scene),
+        "mean_speed": mean_speed(evaluation, scene),
+        "granular_temperature": granular_temperature(evaluation, scene),
+        "snapshots": snapshots(evaluation.cases[0], scene),
     }
     if scene.angle_of_repose is not None:
         figures["angle_of_repose"] = angle_of_repose(evaluation, scene)
-    figures["overlap"] = overlap(evaluation, scene)
-    figures["snapshots"] = snapshots(evaluation.cases[0], scene)
-    files = []
-    for name, figure in figures.items():
-        for ending in ("png", "svg"):
-            path = folder / f"{name}.{ending}"
-            figure.savefig(path, dpi=150, bbox_inches="tight")
-            files.append(path)
-    return files
+    return figures
 
 
 def rollout_error(evaluation: Evaluation, scene: Scene) -> Figure:
@@ -99,19 +107,26 @@ def center_of_mass_height(evaluation: Evaluation, scene: Scene) -> Figure:
 def angle_of_repose(evaluation: Evaluation, scene: Scene) -> Figure:
     """Angle of repose against time, every test case; the averaged part is shaded."""
     figure, axes = _figure(f"{scene.name}: angle of repose", "angle of the free surface (degrees)")
+    half = round(0.05 / scene.frame_dt_s)  # a single frame's angle scatters by several degrees
 
     def angle(observed: Observables) -> np.ndarray:
-        return np.zeros(0) if observed.angle_of_repose_deg is None else observed.angle_of_repose_deg
+        angle_deg = observed.angle_of_repose_deg
+        return np.zeros(0) if angle_deg is None else _running_mean(angle_deg, half)
 
     _compare(axes, evaluation, angle)
     times_s, known = _longest(evaluation), evaluation.climatology
     if known.angle_of_repose_deg is not None:
-        climatology = np.interp(times_s, known.times_s, known.angle_of_repose_deg)
+        climatology = np.interp(times_s, known.times_s, _running_mean(known.angle_of_repose_deg, half))
         axes.plot(times_s, climatology, color="black", linestyle=CLIMATOLOGY, linewidth=1.8)
-    note = ""
+    note = f"running mean over {(2 * half + 1) * scene.frame_dt_s:.2g} s"
     if scene.angle_of_repose is not None and scene.angle_of_repose.from_s < times_s[-1]:
-        axes.axvspan(max(scene.angle_of_repose.from_s, times_s[0]), times_s[-1], color="0.92", zorder=0)
-        note = "averaged over the shaded part"
+        start_s = max(scene.angle_of_repose.from_s, times_s[0])
+        if scene.angle_of_repose.kind == "radial":  # an angle from before the heap has formed means nothing
+            steady = np.concatenate([np.asarray(x.get_ydata())[x.get_xdata() >= start_s] for x in axes.get_lines()])
+            if np.isfinite(steady).any():
+                axes.set_ylim(min(np.nanmin(steady) - 15, 0.0), np.nanmax(steady) + 15)
+        axes.axvspan(start_s, times_s[-1], color="0.92", zorder=0)
+        note += "; the angle of repose is averaged over the shaded part"
     return _finish(figure, axes, handles=_style_handles(evaluation, climatology=True), note=note)
 
 
@@ -122,6 +137,25 @@ def overlap(evaluation: Evaluation, scene: Scene) -> Figure:
     if any((case.model.overlap_ratio > 0).any() for case in evaluation.cases):
         axes.set_yscale("log")
     return _finish(figure, axes, handles=_style_handles(evaluation, climatology=False), note="frame 0 is DEM's own")
+
+
+def mean_speed(evaluation: Evaluation, scene: Scene) -> Figure:
+    """Mean finite-difference speed against time, every test case."""
+    figure, axes = _figure(f"{scene.name}: mean speed of the grains", "mean speed (m/s)")
+    _compare(axes, evaluation, lambda observed: observed.mean_speed_m_s)
+    note = "displacement over one frame, in DEM as in the network"
+    return _finish(figure, axes, handles=_style_handles(evaluation, climatology=False), note=note)
+
+
+def granular_temperature(evaluation: Evaluation, scene: Scene) -> Figure:
+    """Granular temperature against time, every test case: what a network that smooths collisions loses."""
+    unit = "m\N{SUPERSCRIPT TWO}/s\N{SUPERSCRIPT TWO}"
+    figure, axes = _figure(f"{scene.name}: granular temperature", f"granular temperature ({unit})")
+    _compare(axes, evaluation, lambda observed: observed.granular_temperature_m2_s2)
+    if any((case.dem.granular_temperature_m2_s2 > 0).any() for case in evaluation.cases):
+        axes.set_yscale("log")
+    note = "velocity fluctuation against neighbours within three radii"
+    return _finish(figure, axes, handles=_style_handles(evaluation, climatology=False), note=note)
 
 
 def snapshots(case: CaseEvaluation, scene: Scene, n_times: int = 4) -> Figure:
@@ -142,7 +176,7 @@ def snapshots(case: CaseEvaluation, scene: Scene, n_times: int = 4) -> Figure:
     (left, low), (edge, high) = _frame_of_view(result.dem_pos, scene, right, up)
     width = 2.3
     size = (width * len(frames) + 1.0, 2 * width * float(np.clip((high - low) / (edge - left), 0.5, 2.0)) + 0.9)
-    figure = _bare_figure(size)
+    figure = _bare_figure(size, "compressed")
     grid = figure.subplots(2, len(frames), squeeze=False, sharex=True, sharey=True)
     diameters = 2 * result.radius
     for row, (name, pos) in zip(grid, rows.items(), strict=True):
@@ -152,7 +186,7 @@ def snapshots(case: CaseEvaluation, scene: Scene, n_times: int = 4) -> Figure:
             grains = EllipseCollection(
                 diameters[order], diameters[order], 0.0, units="xy", offsets=points, offset_transform=axes.transData
             )
-            grains.set(array=speed[order], norm=scale, cmap="cividis", edgecolor="0.15", linewidth=0.15)
+            grains.set(array=speed[order], norm=scale, cmap="viridis", edgecolor="0.15", linewidth=0.15)
             grains.set_rasterized(True)  # thousands of circles would make an SVG of many megabytes
             axes.add_collection(grains)
             axes.add_collection(_wall_lines(scene, float(result.times_s[frame]), right, up, depth))
@@ -169,9 +203,9 @@ def snapshots(case: CaseEvaluation, scene: Scene, n_times: int = 4) -> Figure:
 # --------------------------------------------------------------------------------------------------- building blocks
 
 
-def _bare_figure(size: tuple[float, float]) -> Figure:
+def _bare_figure(size: tuple[float, float], layout: Literal["constrained", "compressed"] = "constrained") -> Figure:
     """A figure outside pyplot: nothing global, nothing to close."""
-    figure = Figure(figsize=size, layout="constrained")
+    figure = Figure(figsize=size, layout=layout)
     FigureCanvasAgg(figure)
     return figure
 
@@ -187,16 +221,15 @@ def _figure(title: str, ylabel: str) -> tuple[Figure, Axes]:
 
 
 def _finish(figure: Figure, axes: Axes, handles: list[Line2D] | None = None, note: str = "") -> Figure:
-    if axes.get_yscale() == "linear":
-        axes.set_ylim(bottom=min(0.0, axes.get_ylim()[0]))
+    if axes.get_yscale() == "linear" and axes.dataLim.ymin >= 0:
+        axes.set_ylim(bottom=0.0)
     axes.margins(x=0.01)
-    if handles is None:
-        handles, _ = axes.get_legend_handles_labels()
+    shown: Sequence[Artist] = axes.get_legend_handles_labels()[0] if handles is None else handles
     axes.legend(
-        handles=handles,
+        handles=shown,
         loc="upper left",
         bbox_to_anchor=(0.0, -0.14),
-        ncols=3 if len(handles) > 3 else 2,
+        ncols=3 if len(shown) > 3 else 2,
         frameon=False,
         fontsize=9,
         title=note or None,
@@ -210,12 +243,13 @@ def _compare(axes: Axes, evaluation: Evaluation, of: Callable[[Observables], np.
     """Draws one curve of every case: DEM solid, network dashed, a colour per case."""
     for index, case in enumerate(evaluation.cases):
         color, times_s = CASE_COLORS[index % len(CASE_COLORS)], case.result.times_s
-        axes.plot(times_s, of(case.dem), color=color, linestyle=DEM, linewidth=1.2)
-        axes.plot(times_s, of(case.model), color=color, linestyle=NETWORK, linewidth=1.6)
+        for observed, style, width in ((case.dem, DEM, 1.2), (case.model, NETWORK, 1.6)):
+            curve = of(observed)  # a curve of steps is one frame shorter
+            axes.plot(times_s[: len(curve)], curve, color=color, linestyle=style, linewidth=width)
 
 
 def _style_handles(evaluation: Evaluation, climatology: bool) -> list[Line2D]:
-    styles = {"DEM": DEM, "network": NETWORK}
+    styles: dict[str, Style] = {"DEM": DEM, "network": NETWORK}
     if climatology:
         styles["mean of training cases"] = CLIMATOLOGY
     handles = [Line2D([], [], color="black", linestyle=style, label=name) for name, style in styles.items()]
@@ -231,6 +265,15 @@ def _mean_curve(
     """Times and mean over cases, as far as all of them reach."""
     shortest = min((case.result.times_s for case in evaluation.cases), key=len)
     return shortest, factor * np.mean([of(case)[: len(shortest)] for case in evaluation.cases], axis=0)
+
+
+def _running_mean(values: np.ndarray, half: int) -> np.ndarray:
+    """Mean of the finite values among each one's `half` neighbours on either side; nan where there are none."""
+    window = np.ones(2 * half + 1)
+    known = np.isfinite(values)
+    total = np.convolve(np.where(known, values, 0.0), window)[half : half + len(values)]
+    count = np.convolve(known.astype(float), window)[half : half + len(values)]
+    return np.where(count > 0, total / np.maximum(count, 1.0), np.nan)
 
 
 def _longest(evaluation: Evaluation) -> np.ndarray:
@@ -271,7 +314,7 @@ def _wall_lines(scene: Scene, time_s: float, right: np.ndarray, up: np.ndarray, 
         placed = to_world(part.motion, vertices, torch.tensor([time_s], dtype=torch.float64))[0][0].numpy()
         edges = _silhouette(Trimesh(placed, mesh.faces, process=False), depth)
         lines.append(placed[edges] @ np.stack([right, up], axis=1))
-    return LineCollection(np.concatenate(lines) if lines else [], colors="0.3", linewidths=0.8)
+    return LineCollection([edge for part_lines in lines for edge in part_lines], colors="0.3", linewidths=0.8)
 
 
 def _silhouette(mesh: Trimesh, depth: np.ndarray) -> np.ndarray:

@@ -1,5 +1,6 @@
 """The few lines that a run ends with: what the network does, beside what costs nothing and beside DEM."""
 
+import math
 from collections.abc import Mapping
 from typing import Any
 
@@ -28,15 +29,16 @@ def metric_rows(metrics: Mapping[str, Any]) -> list[tuple[str, str, str]]:
 
     def with_error(key: str, error: str) -> str:
         value = metrics.get(error)
-        return degrees(key) + (f" \N{PLUS-MINUS SIGN} {value:.1g}\N{DEGREE SIGN}" if _known(value) else "")
+        return degrees(key) + (f" \N{PLUS-MINUS SIGN} {value:.1f}\N{DEGREE SIGN}" if _known(value) else "")
 
     trivial = millimetres("test/one_step_error_trivial_m")
+    trivial_name = metrics.get("test/one_step_error_trivial_name") or ""
     rows = [
         ("", "network", "beside"),
         (
             "one-step error, whole run",
             millimetres("test/one_step_error_m"),
-            f"{trivial} {metrics.get('test/one_step_error_trivial_name', '')} (best trivial predictor)",
+            f"{trivial} {trivial_name} (best trivial predictor)",
         ),
         ("one-step error, at the start", millimetres("test/one_step_error_at_start_m"), ""),
         (
@@ -65,20 +67,24 @@ def metric_rows(metrics: Mapping[str, Any]) -> list[tuple[str, str, str]]:
             ),
         ]
     own, yade = (metrics.get(f"speed/{name}seconds_per_simulated_second") for name in ("", "yade_"))
-    factor = f", network {yade / own:.3g} times as fast" if _known(own) and _known(yade) and own > 0 else ""
-    cores = metrics.get("speed/yade_cores")
+    factor = ""
+    if own is not None and yade is not None and own > 0:
+        factor = f", network {yade / own:.3g} times as fast"
+    cores, yade_dt = (
+        _count(metrics.get("speed/yade_cores")),
+        _number(metrics.get("speed/yade_dt_s"), 1e6, " \N{MICRO SIGN}s"),
+    )
     rows += [
         (
             "overlap, of a diameter",
             _number(metrics.get("test/mean_overlap_ratio"), 100.0, " %"),
             _number(metrics.get("test/mean_overlap_ratio_dem"), 100.0, " %") + " DEM",
         ),
-        ("escaped grains, all cases", str(metrics.get("test/escaped_grains", MISSING)), ""),
+        ("escaped grains, all cases", _count(metrics.get("test/escaped_grains")), ""),
         (
             "time per simulated second",
             _number(own, 1.0, " s"),
-            f"{_number(yade, 1.0, ' s')} Yade (dt {_number(metrics.get('speed/yade_dt_s'), 1e6, ' \N{MICRO SIGN}s')}, "
-            f"{cores} core{'' if cores == 1 else 's'}){factor}",
+            f"{_number(yade, 1.0, ' s')} Yade (dt {yade_dt}, {cores} core{'' if cores == '1' else 's'}){factor}",
         ),
     ]
     return rows
@@ -92,7 +98,11 @@ def _grid(rows: list[tuple[str, str, str]]) -> str:
 
 
 def _known(value: Any) -> bool:
-    return isinstance(value, int | float) and value == value
+    return isinstance(value, int | float) and math.isfinite(value)
+
+
+def _count(value: Any) -> str:
+    return str(value) if _known(value) else MISSING
 
 
 def _number(value: Any, factor: float, unit: str) -> str:
