@@ -1,0 +1,174 @@
+"""Trajectory files: what goes in comes out, reading is lazy, a broken file says everything that is wrong with it."""
+
+import pickle
+from pathlib import Path
+
+import h5py
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from gns_pyg.data.schema import GRAINS, RUN_KEYS, UNITS
+from gns_pyg.data.trajectory import CHUNK_FRAMES, Trajectory, TrajectoryWriter
+from gns_pyg.errors import DataError
+
+RUN = {"wall_clock_s": 1.5, "cores": 1, "steps": 200, "dt_s": 1e-4, "creator": "Yade", "creator_version": "2023.02a"}
+DECIMALS = {"position": 7, "velocity": 5, "angular_velocity": 3}
+BOUNDARY = {"floor": {"vertices": np.eye(3), "triangles": [[0, 1, 2]], "motion": {"kind": "none"}}}
+
+
+def fields(n_frames: int, n_grains: int, seed: int = 0) -> dict[str, np.ndarray]:
+    generator = np.random.default_rng(seed)
+    return {name: generator.uniform(-3, 3, (n_frames, n_grains, 3)) for name in UNITS}
+
+
+def write(path: Path, values: dict[str, np.ndarray]) -> Path:
+    n_frames, n_grains = values["position"].shape[:2]
+    scene = {"name": "test", "grains": {"count": n_grains}}
+    with TrajectoryWriter(path, scene, np.full(n_grains, 0.01), np.full(n_grains, 0.004), BOUNDARY, DECIMALS) as writer:
+        for k in range(n_frames):
+            writer.append(100 * k, 0.01 * k, *(values[name][k] for name in UNITS))
+        writer.finish(RUN | {"case": 3})
+    return path
+
+
+@pytest.fixture
+def good(tmp_path) -> Path:
+    return write(tmp_path / "case.h5", fields(20, 5))
+
+
+@settings(max_examples=15, deadline=None)
+@given(n_frames=st.integers(1, 2 * CHUNK_FRAMES + 1), n_grains=st.integers(1, 6), seed=st.integers(0, 99))
+def test_what_goes_in_comes_out(tmp_path_factory, n_frames, n_grains, seed) -> None:
+    values = fields(n_frames, n_grains, seed)
+    trajectory = Trajectory(write(tmp_path_factory.mktemp("data") / "case.h5", values))
+    assert (trajectory.n_frames, trajectory.n_grains) == (n_frames, n_grains)
+    for name, decimals in DECIMALS.items():
+        assert trajectory.read(name) == pytest.approx(values[name], abs=0.51 * 10**-decimals)
+    assert trajectory.times_s == pytest.approx(0.01 * np.arange(n_frames))
+    assert trajectory.scene["name"] == "test"
+    assert trajectory.run == RUN | {"case": 3}
+    assert trajectory.radius.tolist() == [0.01] * n_grains
+
+
+def test_a_part_of_the_frames_is_that_part_of_the_whole(good) -> None:
+    trajectory = Trajectory(good)
+    assert (trajectory.read("velocity", 7, 12) == trajectory.read("velocity")[7:12]).all()
+
+
+def test_opening_reads_no_frames_and_an_open_trajectory_travels_to_workers(good) -> None:
+    trajectory = Trajectory(good)
+    assert trajectory._file is None
+    whole = trajectory.read("position")
+    assert (pickle.loads(pickle.dumps(trajectory)).read("position") == whole).all()
+
+
+def test_the_hash_is_that_of_the_run_and_not_of_the_name(good, tmp_path) -> None:
+    same = write(tmp_path / "other.h5", fields(20, 5))
+    different = write(tmp_path / "different.h5", fields(20, 5, seed=1))
+    assert Trajectory(good).content_hash() == Trajectory(same).content_hash()
+    assert Trajectory(good).content_hash() != Trajectory(different).content_hash()
+
+
+def test_the_layout_is_h5md(good) -> None:
+    with h5py.File(good) as file:
+        assert tuple(file["h5md"].attrs["version"]) == (1, 1)
+        assert "name" in file["h5md/author"].attrs
+        assert file["h5md/creator"].attrs["name"] == "Yade"
+        assert file[f"{GRAINS}/box"].attrs["dimension"] == 3
+        assert list(file[f"{GRAINS}/box"].attrs["boundary"]) == ["none"] * 3
+        for name, unit in UNITS.items():
+            element = file[f"{GRAINS}/{name}"]
+            assert element["value"].attrs["unit"] == unit
+            assert element["time"].attrs["unit"] == "s"
+            assert element["step"][:].tolist() == list(range(0, 2000, 100))
+        assert file[f"{GRAINS}/velocity/time"] == file[f"{GRAINS}/position/time"]  # one data set, linked
+        assert file["boundary/floor/vertices"].shape == (3, 3)
+
+
+def test_the_boundary_comes_back(good) -> None:
+    (name,) = Trajectory(good).boundary
+    assert (Trajectory(good).boundary[name]["vertices"] == np.eye(3)).all()
+    assert Trajectory(good).boundary[name]["motion"] == {"kind": "none"}
+
+
+def test_every_violation_is_reported_at_once(good) -> None:
+    with h5py.File(good, "a") as file:
+        del file["h5md"], file[f"{GRAINS}/mass"], file["parameters"].attrs["dt_s"], file[f"{GRAINS}/box"]
+        file[f"{GRAINS}/velocity/value"].attrs["unit"] = "km h-1"
+        file[f"{GRAINS}/position/time"][4] = 0.0
+        file[f"{GRAINS}/radius"][2] = -1.0
+    with pytest.raises(DataError) as caught:
+        Trajectory(good)
+    told = str(caught.value)
+    for fragment in ("h5md", "mass", "dt_s", "box", "km h-1", "strictly increasing", "radius"):
+        assert fragment in told
+    assert "docs/data_format.md" in told
+
+
+def replace(path: Path, name: str, value: np.ndarray) -> None:
+    with h5py.File(path, "a") as file:
+        unit = file[f"{GRAINS}/{name}/value"].attrs["unit"]
+        del file[f"{GRAINS}/{name}/value"]
+        file.create_dataset(f"{GRAINS}/{name}/value", data=value).attrs["unit"] = unit
+
+
+@pytest.mark.parametrize(
+    ("value", "told"),
+    [
+        (np.zeros((20, 4, 3)), r"shape \(20, 4, 3\), expected \(20, 5, 3\)"),
+        (np.zeros((20, 5)), r"expected floats \(n_frames, n_grains, 3\)"),
+        (np.zeros((20, 5, 3), int), "int64"),
+        (np.where(np.arange(300).reshape(20, 5, 3) == 200, np.nan, 0.0), "not finite at frame 13, grain 1"),
+    ],
+)
+def test_a_field_of_wrong_shape_type_or_content_is_refused(good, value, told) -> None:
+    replace(good, "angular_velocity", value)
+    with pytest.raises(DataError, match=told):
+        Trajectory(good)
+
+
+@pytest.mark.parametrize("share", [0.0, 0.1, 0.5, 0.95])
+def test_a_truncated_file_is_refused(good, share) -> None:
+    data = good.read_bytes()
+    good.write_bytes(data[: int(share * len(data))])
+    with pytest.raises(DataError, match=r"case\.h5"):
+        Trajectory(good)
+
+
+def test_a_missing_file_names_the_command_that_makes_it(tmp_path) -> None:
+    with pytest.raises(DataError, match=r"data_gen\.generate"):
+        Trajectory(tmp_path / "nothing.h5")
+
+
+def leftovers(folder: Path) -> list[str]:
+    return [path.name for path in folder.iterdir()]
+
+
+def test_a_run_that_fails_leaves_no_file(tmp_path) -> None:
+    values = fields(10, 5)
+    values["velocity"][6, 2, 1] = np.inf
+    with pytest.raises(DataError, match="velocity of grain 2 is not finite at step 600"):
+        write(tmp_path / "case.h5", values)
+    assert leftovers(tmp_path) == []
+
+
+def test_a_run_without_all_its_facts_is_refused(tmp_path) -> None:
+    with (
+        pytest.raises(DataError, match=RUN_KEYS[0]),
+        TrajectoryWriter(tmp_path / "case.h5", {}, np.ones(1), np.ones(1), {}, DECIMALS) as writer,
+    ):
+        writer.finish({})
+    assert leftovers(tmp_path) == []
+
+
+def test_the_final_name_appears_only_when_the_run_is_complete(tmp_path) -> None:
+    frame = np.zeros((1, 3))
+    with TrajectoryWriter(tmp_path / "case.h5", {}, np.ones(1), np.ones(1), {}, DECIMALS) as writer:
+        for k in range(2 * CHUNK_FRAMES):
+            writer.append(k, 0.1 * k, frame, frame, frame)
+        assert not (tmp_path / "case.h5").exists()
+        writer.finish(RUN)
+        assert leftovers(tmp_path) == ["case.h5"]
+    assert leftovers(tmp_path) == ["case.h5"]

@@ -1,0 +1,155 @@
+"""Meshes: closed where they must be, the winding number against analytic bodies, distances, every user error."""
+
+import numpy as np
+import pytest
+import trimesh
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from gns_pyg.errors import ConfigError, GeometryError
+from gns_pyg.scene.mesh import build_mesh, distance, inside
+from gns_pyg.scene.scene import Part
+
+PROFILE = [[0.25, 0.0], [0.25, 0.3], [0.1, 0.45], [0.25, 0.6], [0.25, 0.9]]
+
+
+def part(**shape) -> Part:
+    return Part(shape=shape, points=100, friction_angle_rad=0.5)
+
+
+def hopper(segments: int = 96):
+    return build_mesh("hopper", part(kind="revolution", profile_m=PROFILE, segments=segments))
+
+
+@pytest.mark.parametrize(
+    ("shape", "volume", "area"),
+    [
+        ({"kind": "box", "size_m": [1.0, 2.0, 3.0], "center_m": [5.0, 0.0, 0.0]}, 6.0, 22.0),
+        (
+            {"kind": "cylinder", "radius_m": 0.5, "length_m": 2.0, "axis": [1, 1, 0], "segments": 400},
+            np.pi / 2,
+            2.5 * np.pi,
+        ),
+        (
+            {"kind": "revolution", "profile_m": [[0.0, 0.0], [1.0, 1.0]], "segments": 400},
+            np.pi / 3,
+            np.pi * (1 + 2**0.5),
+        ),
+    ],
+)
+def test_primitives_are_closed_and_have_the_volume_and_area_of_their_body(shape, volume, area) -> None:
+    mesh = build_mesh("body", part(**shape))
+    assert mesh.is_watertight
+    assert mesh.is_winding_consistent
+    assert mesh.volume == pytest.approx(volume, rel=1e-3)
+    assert mesh.area == pytest.approx(area, rel=1e-3)
+
+
+def test_a_cylinder_lies_along_its_axis_around_the_origin() -> None:
+    mesh = build_mesh("drum", part(kind="cylinder", radius_m=0.15, length_m=0.6, axis=[-2.0, 0.0, 0.0], segments=72))
+    assert mesh.bounds[:, 0] == pytest.approx([-0.3, 0.3])
+    assert np.hypot(mesh.vertices[:, 1], mesh.vertices[:, 2]).max() == pytest.approx(0.15)
+
+
+def test_inside_agrees_with_the_analytic_hopper() -> None:
+    pos = np.random.default_rng(0).uniform([-0.3, -0.3, -0.1], [0.3, 0.3, 1.0], (20_000, 3))
+    radius, allowed = np.hypot(pos[:, 0], pos[:, 1]), np.interp(pos[:, 2], *np.array(PROFILE)[:, ::-1].T)
+    within = (radius < allowed) & (pos[:, 2] > 0) & (pos[:, 2] < 0.9)
+    clear = np.abs(radius - allowed) > 0.001  # the polygon's sides lie within 0.2 mm of the circle
+    assert (inside(hopper(), pos) == within)[clear].all()
+
+
+@settings(max_examples=20, deadline=None)
+@given(st.integers(0, 2**32 - 1))
+def test_inside_does_not_depend_on_where_a_body_lies_and_how_it_is_wound(seed) -> None:
+    generator = np.random.default_rng(seed)
+    mesh, pos = hopper(12), generator.uniform(-0.3, 0.9, (200, 3))
+    pose = trimesh.transformations.random_rotation_matrix(generator.uniform(size=3))
+    pose[:3, 3] = generator.uniform(-5, 5, 3)
+    moved = mesh.copy().apply_transform(pose)
+    assert (inside(moved, trimesh.transform_points(pos, pose)) == inside(mesh, pos)).all()
+
+
+def test_inside_is_the_same_in_one_block_and_in_many(monkeypatch) -> None:
+    pos = np.random.default_rng(0).uniform(-0.3, 0.9, (500, 3))
+    whole = inside(hopper(12), pos), distance(hopper(12), pos)
+    monkeypatch.setattr("gns_pyg.scene.mesh.BLOCK", 1)
+    assert (inside(hopper(12), pos) == whole[0]).all()
+    assert distance(hopper(12), pos) == pytest.approx(whole[1])
+
+
+def test_no_points_give_no_answers() -> None:
+    assert inside(hopper(12), np.zeros((0, 3))).shape == (0,)
+    assert distance(hopper(12), np.zeros((0, 3))).shape == (0,)
+
+
+def test_distance_to_a_box_is_exact_on_both_sides() -> None:
+    mesh = build_mesh("box", part(kind="box", size_m=[2.0, 2.0, 2.0]))
+    pos = np.random.default_rng(0).uniform(-2, 2, (2000, 3))
+    outside = np.linalg.norm(np.maximum(np.abs(pos) - 1, 0), axis=1)
+    within = np.clip(1 - np.abs(pos).max(axis=1), 0, None)
+    assert distance(mesh, pos) == pytest.approx(outside + within, abs=1e-12)
+
+
+def test_distance_to_any_mesh_is_that_of_its_nearest_surface_point() -> None:
+    mesh = hopper(12)
+    surface = trimesh.sample.sample_surface(mesh, 200_000, seed=0)[0]
+    pos = np.random.default_rng(1).uniform(-0.3, 0.9, (50, 3))
+    sampled = np.array([np.linalg.norm(surface - point, axis=1).min() for point in pos])
+    assert (sampled >= distance(mesh, pos) - 1e-12).all()
+    assert sampled == pytest.approx(distance(mesh, pos), abs=0.01)
+
+
+@pytest.mark.parametrize("suffix", ["stl", "obj", "ply"])
+def test_a_mesh_file_is_the_same_body_in_the_unit_that_scale_says(tmp_path, suffix) -> None:
+    path = tmp_path / f"box.{suffix}"
+    trimesh.creation.box([200.0, 100.0, 50.0]).export(path)
+    mesh = build_mesh("box", part(kind="file", path=str(path), scale=0.001))
+    assert mesh.is_watertight
+    assert mesh.extents == pytest.approx([0.2, 0.1, 0.05])
+
+
+def test_a_file_wound_inside_out_is_turned(tmp_path) -> None:
+    box = trimesh.creation.box([1.0, 1.0, 1.0])
+    box.invert()
+    box.export(tmp_path / "box.stl")
+    mesh = build_mesh("box", part(kind="file", path=str(tmp_path / "box.stl")))
+    assert mesh.volume > 0
+    assert inside(mesh, np.zeros((1, 3))).all()
+
+
+def test_an_open_surface_has_no_inside_and_the_error_counts_its_open_edges(tmp_path) -> None:
+    box = trimesh.creation.box([1.0, 1.0, 1.0])
+    box.update_faces(np.arange(len(box.faces)) > 0)
+    box.export(tmp_path / "open.stl")
+    mesh = build_mesh("box", part(kind="file", path=str(tmp_path / "open.stl")))
+    with pytest.raises(GeometryError, match=r"3 open edges[\s\S]*close the holes"):
+        inside(mesh, np.zeros((1, 3)))
+
+
+@pytest.mark.parametrize(
+    ("shape", "key"),
+    [
+        ({}, "shape.kind"),
+        ({"kind": "sphere"}, "shape.kind"),
+        ({"kind": "cylinder", "radius_m": 1.0}, "shape.length_m"),
+        ({"kind": "cylinder", "radius_m": 1.0, "length_m": 1.0, "radios_m": 2.0}, "shape.radios_m"),
+        ({"kind": "cylinder", "radius_m": -1.0, "length_m": 1.0}, "shape.radius_m"),
+        ({"kind": "cylinder", "radius_m": 1.0, "length_m": "long"}, "shape.length_m"),
+        ({"kind": "cylinder", "radius_m": 1.0, "length_m": 1.0, "axis": [0, 0, 0]}, "shape.axis"),
+        ({"kind": "revolution", "profile_m": [[1.0, 0.0]]}, "shape.profile_m"),
+        ({"kind": "revolution", "profile_m": [[1.0, 0.0], [-1.0, 1.0]]}, "shape.profile_m"),
+        ({"kind": "revolution", "profile_m": PROFILE, "segments": 2}, "shape.segments"),
+        ({"kind": "box", "size_m": [1.0, 1.0]}, "shape.size_m"),
+        ({"kind": "file", "path": "nowhere/drum.stl"}, "shape.path"),
+    ],
+)
+def test_a_wrong_shape_is_named_by_its_key(shape, key) -> None:
+    with pytest.raises(ConfigError, match=f"scene.boundary.drum.{key}"):
+        build_mesh("drum", part(**shape))
+
+
+def test_a_file_that_is_no_mesh_is_refused(tmp_path) -> None:
+    (tmp_path / "drum.stl").write_text("solid nothing\nendsolid nothing\n")
+    with pytest.raises(GeometryError, match=r"drum\.stl"):
+        build_mesh("drum", part(kind="file", path=str(tmp_path / "drum.stl")))
