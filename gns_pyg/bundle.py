@@ -82,14 +82,16 @@ def load(folder: str | Path) -> Simulator:
     path = folder / "weights.safetensors"
     try:
         weights = load_file(path)
-        boundary = {
-            name: BoundaryPoints(weights[f"wall_pos_{name}"].numpy(), weights[f"wall_normal_{name}"].numpy())
+        points = {
+            name: BoundaryPoints(
+                weights[f"boundary.parts.{name}.pos"].numpy(), weights[f"boundary.parts.{name}.normal"].numpy()
+            )
             for name in scene.boundary
         }
         simulator = Simulator(
             scene,
             typed(ModelConfig, description.get("model"), "model"),
-            boundary,
+            points,
             typed(Statistics, description.get("statistics"), "statistics"),
         )
         simulator.load_state_dict(weights)

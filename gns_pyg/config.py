@@ -1,8 +1,9 @@
 """From plain config values to typed records: every key known, every type checked, one clear error."""
 
 from collections.abc import Mapping
+from dataclasses import fields
 from pathlib import Path
-from typing import Any, TypeVar
+from typing import Any, TypeVar, cast
 
 from omegaconf import OmegaConf
 from omegaconf.errors import OmegaConfBaseException
@@ -29,11 +30,11 @@ def typed(record: type[Record], values: Any, where: str) -> Record:
         raise ConfigError(where, repr(values), f"a mapping with the keys of {record.__name__}", "see conf/")
     try:
         merged = OmegaConf.merge(OmegaConf.structured(record), values)
-        return OmegaConf.to_object(merged)
+        return cast(Record, OmegaConf.to_object(merged))
     except OmegaConfBaseException as error:
         key = getattr(error, "full_key", None)
         reason = str(error).splitlines()[0]
-        known = ", ".join(record.__dataclass_fields__)
+        known = ", ".join(field.name for field in fields(record))  # type: ignore[arg-type]
         raise ConfigError(
             f"{where}.{key}" if key else where,
             reason,

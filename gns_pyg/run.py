@@ -33,7 +33,8 @@ from gns_pyg.evaluation.predict import initial_state, one_step_errors, roll_out,
 from gns_pyg.report.page import write_page
 from gns_pyg.report.plots import write_plots
 from gns_pyg.report.table import metrics_table
-from gns_pyg.scene.boundary_points import sample_boundary
+from gns_pyg.scene.boundary_points import sample_boundary_points
+from gns_pyg.scene.mesh import build_mesh
 from gns_pyg.scene.scene import Scene
 from gns_pyg.training.config import TrainingConfig
 from gns_pyg.training.module import TrainingModule
@@ -77,16 +78,20 @@ def train(cfg: DictConfig) -> dict[str, Any]:
         log_every_n_steps=50,
     )
     trainer.fit(TrainingModule(simulator, training), datamodule, ckpt_path=cfg.ckpt_path, weights_only=True)
+    trainer.save_checkpoint(folder / "checkpoints" / "last.ckpt")
     return _judge(simulator.eval(), cases, cfg, folder)
 
 
 def build(scene: Scene, config: ModelConfig, cases: Split, seed: int) -> Simulator:
     """A new simulator for a scene, its scales measured on the training cases, its weights drawn from `seed`."""
     statistics = measure(cases.train, Integrator(scene, config.state, residual=config.residual))
-    boundary = {name: sample_boundary(name, part, scene.seed) for name, part in scene.boundary.items()}
+    points = {
+        name: sample_boundary_points(build_mesh(name, part), part.points, scene.seed)
+        for name, part in scene.boundary.items()
+    }
     with torch.random.fork_rng():
         torch.manual_seed(seed)
-        return Simulator(scene, config, boundary, statistics)
+        return Simulator(scene, config, points, statistics)
 
 
 def quiet_lightning() -> None:

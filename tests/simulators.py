@@ -4,11 +4,12 @@ from typing import Any
 
 import numpy as np
 import torch
-from gns_pyg.scene.boundary_points import sample_boundary
 
 from gns_pyg.dynamics.model_config import ModelConfig
 from gns_pyg.dynamics.simulator import Simulator
 from gns_pyg.models.statistics import Statistics
+from gns_pyg.scene.boundary_points import sample_boundary_points
+from gns_pyg.scene.mesh import build_mesh
 from gns_pyg.scene.scene import Scene
 from gns_pyg.state import State
 
@@ -41,9 +42,11 @@ def simulator(scene: Scene, seed: int = 0, dtype: torch.dtype = torch.float32, *
     config = ModelConfig(**(MODEL | changes))
     groups = 1 + ("differences", "velocity", "full").index(config.state)
     statistics = Statistics(**STATISTICS, correction=[0.1, 0.2, 10.0][:groups])
-    boundary = {name: sample_boundary(name, part, 0) for name, part in scene.boundary.items()}
+    points = {
+        name: sample_boundary_points(build_mesh(name, part), part.points) for name, part in scene.boundary.items()
+    }
     torch.manual_seed(seed)
-    return Simulator(scene, config, boundary, statistics).to(dtype).eval()
+    return Simulator(scene, config, points, statistics).to(dtype).eval()
 
 
 def state_in_box(n_per_graph: list[int], seed: int = 0, half_m: float = 0.06, spin: bool = True) -> State:

@@ -61,7 +61,7 @@ class UpdateSampler(Sampler):
         self.n_items, self.batch_size, self.seed, self.first_update = n_items, batch_size, seed, first_update
 
     def __iter__(self) -> Iterator[list[int]]:
-        position, order, epoch = self.first_update * self.batch_size, None, -1
+        position, order, epoch = self.first_update * self.batch_size, np.empty(0, int), -1
         while True:
             batch = []
             for place in range(position, position + self.batch_size):

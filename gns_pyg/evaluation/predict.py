@@ -42,7 +42,7 @@ def roll_out(simulator: Simulator, trajectory: Trajectory, start: int) -> tuple[
     Returns:
         Positions, m, (n_frames - start, n_grains, 3), the start first, and wall seconds per simulated second.
     """
-    state = initial_state(simulator, trajectory, start).to(_device(simulator))
+    state = initial_state(simulator, trajectory, start).to(simulator.scale.device)
     n_steps = trajectory.n_frames - 1 - start
     pos = np.empty((n_steps + 1, trajectory.n_grains, 3))
     pos[0] = state.pos.cpu()
@@ -58,14 +58,10 @@ def one_step_errors(simulator: Simulator, trajectory: Trajectory, batch_size: in
     errors = []
     for first in range(0, trajectory.n_frames - 2, batch_size):
         frames = range(first, min(first + batch_size, trajectory.n_frames - 2))
-        window = Window.collate([read_window(trajectory, frame, 3) for frame in frames]).to(_device(simulator))
+        window = Window.collate([read_window(trajectory, frame, 3) for frame in frames]).to(simulator.scale.device)
         predicted = simulator(simulator.integrator.read(window, 1)).pos
         shape = (len(frames), trajectory.n_grains, 3)
         errors.append(
             position_error(predicted.cpu().numpy().reshape(shape), window.pos[2].cpu().numpy().reshape(shape))
         )
     return np.concatenate(errors)
-
-
-def _device(simulator: Simulator) -> torch.device:
-    return simulator.scale.device

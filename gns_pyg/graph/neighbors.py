@@ -59,10 +59,14 @@ def backend(name: str, device: torch.device) -> Backend:
     return chosen
 
 
-def pairs(index: Index, pos: Float[Tensor, "n 3"], batch: Int[Tensor, " n"], radius: float) -> Int[Tensor, "2 e"]:
-    """All ordered pairs of distinct points of one indexed set within `radius`: [sender, receiver]."""
-    edges = index(pos, batch, radius)
-    return edges[:, edges[0] != edges[1]]
+def pairs(index: Index) -> Index:
+    """The same search without the pair that every point forms with itself; for a set that asks about itself."""
+
+    def search(query: Tensor, query_batch: Tensor, radius: float) -> Tensor:
+        edges = index(query, query_batch, radius)
+        return edges[:, edges[0] != edges[1]]
+
+    return search
 
 
 def _sorted(edges: Tensor, n_points: int) -> Tensor:

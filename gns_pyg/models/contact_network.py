@@ -57,7 +57,7 @@ class ContactNetwork(nn.Module):
         """
         reached, receiver = edge_index[1].unique(return_inverse=True)
         receivers = self.encode_receiver(receiver_features[reached])
-        if self.encode_sender is None:
+        if self.encode_sender is None or sender_features is None:
             sender = torch.searchsorted(reached, edge_index[0])
         else:
             reaching, sender = edge_index[0].unique(return_inverse=True)

@@ -3,17 +3,18 @@
 import logging
 import sys
 import time
+from typing import cast
 
 import numpy as np
 import pytorch_lightning as pl
 from tqdm import tqdm
 
 from gns_pyg.data.trajectory import Trajectory
+from gns_pyg.dynamics.simulator import Simulator
 from gns_pyg.errors import NumericalError
 from gns_pyg.evaluation import observables
 from gns_pyg.evaluation.errors import position_error
 from gns_pyg.evaluation.predict import one_step_errors, roll_out, start_frame
-from gns_pyg.training.module import TrainingModule
 
 log = logging.getLogger(__name__)
 
@@ -53,17 +54,17 @@ class RolloutMetrics(pl.Callback):
     def __init__(self, every_n_updates: int, start_s: float) -> None:
         self.every_n_updates, self.start_s = every_n_updates, start_s
 
-    def on_train_batch_end(self, trainer: pl.Trainer, module: TrainingModule, outputs, batch, batch_idx) -> None:
+    def on_train_batch_end(self, trainer: pl.Trainer, module: pl.LightningModule, outputs, batch, batch_idx) -> None:
         if trainer.global_step % self.every_n_updates == 0:
-            cases = trainer.datamodule.cases.val
-            found = [rollout_metrics(module, case, self.start_s) for case in cases]
+            cases = trainer.datamodule.cases.val  # type: ignore[attr-defined]
+            found = [rollout_metrics(cast(Simulator, module.simulator), case, self.start_s) for case in cases]
             for key in found[0] if found else ():
                 module.log(f"val/{key}", float(np.mean([metrics[key] for metrics in found])), batch_size=len(cases))
 
 
-def rollout_metrics(module: TrainingModule, case: Trajectory, start_s: float) -> dict[str, float]:
+def rollout_metrics(simulator: Simulator, case: Trajectory, start_s: float) -> dict[str, float]:
     """One validation roll-out; a diverging one (early in training) counts as infinitely wrong, not as a crash."""
-    simulator, start = module.simulator, start_frame(case, start_s)
+    start = start_frame(case, start_s)
     scene, dem, times = simulator.scene, case.read("position", start), case.times_s[start:]
     metrics = {"one_step_error_m": float(one_step_errors(simulator, case).mean())}
     try:

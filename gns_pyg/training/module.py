@@ -1,10 +1,10 @@
 """What Lightning drives: one update of a simulator."""
 
 from dataclasses import replace
-from typing import Any
 
 import pytorch_lightning as pl
 import torch
+from pytorch_lightning.utilities.types import OptimizerLRScheduler
 from torch import Tensor
 
 from gns_pyg.dynamics.simulator import Simulator
@@ -51,7 +51,7 @@ class TrainingModule(pl.LightningModule):
         started = self.global_step >= self.config.unroll_from * self.config.updates
         return steps if unrolls and started else 0
 
-    def configure_optimizers(self) -> dict[str, Any]:
+    def configure_optimizers(self) -> OptimizerLRScheduler:
         optimizer = torch.optim.Adam(self.simulator.parameters(), lr=self.config.lr_start)
         stretch = self.config.updates / (self.config.halvings + 1)
         schedule = torch.optim.lr_scheduler.LambdaLR(

@@ -10,6 +10,7 @@ from gns_pyg.data.trajectory import Trajectory
 from gns_pyg.data.windows import read_window
 from gns_pyg.dynamics.rollout import rollout
 from gns_pyg.errors import ConfigError, NumericalError
+from gns_pyg.graph import neighbors
 from tests import scenes
 from tests.simulators import MODEL, PAPER, simulator, state_in_box
 
@@ -76,7 +77,7 @@ def test_translation_without_absolute_position():
     shift = torch.tensor([3.0, -20.0, 7.0], dtype=torch.float64)
     scene = boxed(40)
     model, moved = (simulator(scene, dtype=torch.float64) for _ in range(2))
-    moved.wall_pos_walls += shift
+    moved.boundary.parts.walls.pos += shift
     state = state_in_box([40])
     after = moved(replace(state, pos=state.pos + shift))
     assert torch.allclose(after.pos - shift, model(state).pos, atol=1e-10)
@@ -85,7 +86,7 @@ def test_translation_without_absolute_position():
 def test_absolute_position_does_break_translation():
     shift = torch.tensor([0.3, 0.0, 0.0], dtype=torch.float64)
     model, moved = (simulator(boxed(40), dtype=torch.float64, **PAPER) for _ in range(2))
-    moved.wall_pos_walls += shift
+    moved.boundary.parts.walls.pos += shift
     state = state_in_box([40], spin=False)
     assert not torch.allclose(moved(replace(state, pos=state.pos + shift)).pos - shift, model(state).pos, atol=1e-6)
 
@@ -105,7 +106,7 @@ def test_a_grain_without_edges_flies_free_exactly():
 def test_few_grains_and_no_edges(n):
     model, state = simulator(boxed(1)), state_in_box([n], half_m=1e-3)
     assert model(state).pos.shape == (n, 3)
-    far = replace(state, pos=state.pos + 10)
+    far = replace(state, pos=state.pos + torch.arange(10, 10 + n)[:, None])
     assert torch.equal(model(far).pos, model.integrator.without_contact(far).pos)
 
 
@@ -117,28 +118,24 @@ def test_a_scene_without_walls_has_no_wall_network():
 
 
 def test_static_walls_are_indexed_once():
-    model, calls = simulator(boxed(20)), []
-    from gns_pyg.dynamics import simulator as module
+    model, built = simulator(boxed(20)), []
+    original = neighbors.BACKENDS["kdtree"]
 
-    original = module.backend
+    def counting(points, batch):
+        built.append(len(points))
+        return original.build(points, batch)
 
-    def counting(name, device):
-        search = original(name, device)
-        return replace(search, build=lambda points, batch: calls.append(len(points)) or search.build(points, batch))
-
-    module.backend = counting
-    try:
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setitem(neighbors.BACKENDS, "kdtree", replace(original, build=counting))
         list(rollout(model, state_in_box([20]), 5))
-    finally:
-        module.backend = original
-    assert calls.count(300) == 1
-    assert calls.count(20) == 5
+    assert built.count(300) == 1
+    assert built.count(20) == 5
 
 
 def test_turning_walls_are_searched_where_they_are():
     scene = boxed(20, **TURNING)
     model, state = simulator(scene), state_in_box([12, 8], half_m=0.08)
-    walls, edges = model.walls(state), model.graph(state).wall_edges
+    walls, edges = model.boundary.at(state.time_s), model.graph(state).wall_edges
     n_points = len(walls.pos) // 2
     near = (torch.cdist(walls.pos, state.pos) <= 0.03) & (
         torch.arange(2).repeat_interleave(n_points)[:, None] == state.batch[None]

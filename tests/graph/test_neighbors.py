@@ -61,7 +61,7 @@ def test_equals_brute_force(name, n, m, n_graphs, seed, radius, shift):
 def test_single_and_isolated_grains_have_no_pairs(name):
     for pos in (torch.zeros(1, 3), 5.0 * torch.eye(3)):
         pos, batch = pos.double(), torch.zeros(len(pos), dtype=torch.long)
-        edges = pairs(BACKENDS[name].build(pos, batch), pos, batch, 1.0)
+        edges = pairs(BACKENDS[name].build(pos, batch))(pos, batch, 1.0)
         assert edges.shape == (2, 0)
         assert edges.dtype == torch.long
 
@@ -70,14 +70,14 @@ def test_single_and_isolated_grains_have_no_pairs(name):
 def test_no_neighbour_is_dropped_in_a_crowd(name):
     pos = 1e-3 * cloud(400, 1, 0)[0]
     batch = torch.zeros(400, dtype=torch.long)
-    assert pairs(BACKENDS[name].build(pos, batch), pos, batch, 1.0).shape[1] == 400 * 399
+    assert pairs(BACKENDS[name].build(pos, batch))(pos, batch, 1.0).shape[1] == 400 * 399
 
 
 @every_backend
 def test_far_outlier_does_not_disturb(name):
     pos, batch = cloud(50, 1, 3)
     pos[-1] = torch.tensor([1e7, -1e7, 1e7])
-    edges = pairs(BACKENDS[name].build(pos, batch), pos, batch, 0.3)
+    edges = pairs(BACKENDS[name].build(pos, batch))(pos, batch, 0.3)
     expected = brute_force(pos, batch, pos, batch, 0.3)
     assert torch.equal(edges, expected[:, expected[0] != expected[1]])
 
