@@ -73,8 +73,10 @@ def run_dem(
             arrays[f"vertices/{name}"], arrays[f"triangles/{name}"] = np.array(mesh.vertices), np.array(mesh.faces)
         np.savez(Path(folder) / "arrays.npz", **arrays)
         command = [yade, "-n", "-x", f"-j{cores}", str(SCRIPT), folder, str(SCRIPT.parents[1])]
-        status, tail = _follow(command, progress or (lambda *_: None))
-    clean_stale(path)
+        try:
+            status, tail = _follow(command, progress or (lambda *_: None))
+        finally:
+            clean_stale(path)
     if status != 0 or not path.is_file():
         raise DataError(
             path,

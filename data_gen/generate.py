@@ -129,6 +129,8 @@ def main(config: DictConfig) -> None:
         generate(config)
     except GnsError as error:  # Hydra prints a compact exception without a traceback and exits with status 1
         raise CompactHydraException(str(error)) from None
+    except KeyboardInterrupt:
+        sys.exit("interrupted: the unfinished case was removed, finished ones stay")
 
 
 if __name__ == "__main__":

@@ -89,7 +89,7 @@ def _dense(scene: Scene, meshes: Mapping[str, Trimesh], generator: np.random.Gen
     if len(sites) < n:
         raise _does_not_fit(scene, f"a close-packed lattice has {len(sites)} sites in the region for {n} grains")
     anchor = sites[generator.integers(len(sites))]
-    return sites[cKDTree(sites).query(anchor, k=n)[1].reshape(-1)]
+    return sites[np.atleast_1d(cKDTree(sites).query(anchor, k=n)[1])]
 
 
 def _bounds(scene: Scene, meshes: Mapping[str, Trimesh]) -> tuple[np.ndarray, np.ndarray]:
