@@ -130,6 +130,8 @@ class TrajectoryWriter:
         header = self._file.create_group("h5md")
         header.attrs["version"] = H5MD_VERSION
         header.create_group("author").attrs["name"] = "gns_pyg"
+        units = header.create_group("modules/units")  # H5MD's module that gives the attribute `unit` its meaning
+        units.attrs["version"], units.attrs["system"] = (1, 0), "SI"
         grains = self._file.create_group(GRAINS)
         box = grains.create_group("box")
         box.attrs["dimension"] = 3

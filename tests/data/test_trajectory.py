@@ -75,6 +75,7 @@ def test_the_layout_is_h5md(good) -> None:
     with h5py.File(good) as file:
         assert tuple(file["h5md"].attrs["version"]) == (1, 1)
         assert "name" in file["h5md/author"].attrs
+        assert file["h5md/modules/units"].attrs["system"] == "SI"
         assert file["h5md/creator"].attrs["name"] == "Yade"
         assert file[f"{GRAINS}/box"].attrs["dimension"] == 3
         assert list(file[f"{GRAINS}/box"].attrs["boundary"]) == ["none"] * 3
