@@ -5,17 +5,19 @@ Several graphs are batched by concatenating their grains; `batch` says which gra
 """
 
 from dataclasses import dataclass, fields, replace
-from typing import Self
+from typing import TypeVar
 
 import torch
 from jaxtyping import Float, Int
 from torch import Tensor
 
+AnyRecord = TypeVar("AnyRecord", bound="Record")
+
 
 class Record:
     """A frozen dataclass of tensors that can move between devices."""
 
-    def to(self, device: torch.device | str, non_blocking: bool = False) -> Self:
+    def to(self: AnyRecord, device: torch.device | str, non_blocking: bool = False) -> AnyRecord:
         """Returns a copy with every tensor on `device`; dtypes stay."""
         moved = {
             f.name: value.to(device, non_blocking=non_blocking)

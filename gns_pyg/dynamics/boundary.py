@@ -1,7 +1,7 @@
 """The boundary points of a scene: where they are at a time, and which of them a grain can reach."""
 
 from collections.abc import Callable, Iterable, Iterator, Mapping
-from typing import Self, cast
+from typing import cast
 
 import torch
 from jaxtyping import Float, Int
@@ -34,7 +34,7 @@ class BoundaryPart(nn.Module):
         self.register_buffer("normal", torch.as_tensor(points.normal, dtype=torch.float64))
         self._index: Index | None = None
 
-    def _apply(self, fn: Callable[[Tensor], Tensor], recurse: bool = True) -> Self:
+    def _apply(self, fn: Callable[[Tensor], Tensor], recurse: bool = True) -> "BoundaryPart":
         """Follows the networks to another device, but stays in float64 when they are cast to another dtype."""
         pos, normal = self.pos, self.normal
         super()._apply(fn, recurse)

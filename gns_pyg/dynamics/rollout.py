@@ -1,6 +1,6 @@
 """Feeding a simulator its own output."""
 
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 
 import torch
 
@@ -8,15 +8,15 @@ from gns_pyg.errors import NumericalError
 from gns_pyg.state import State
 
 
-@torch.inference_mode()
-def rollout(simulator: torch.nn.Module, state: State, n_steps: int) -> Iterator[State]:
+def rollout(simulator: Callable[[State], State], state: State, n_steps: int) -> Iterator[State]:
     """Yields the `n_steps` states that follow `state`.
 
     Raises:
         NumericalError: at the first value that is not finite; names step, field and grain.
     """
     for step in range(1, n_steps + 1):
-        state = simulator(state)
+        with torch.inference_mode():
+            state = simulator(state)
         for field in ("pos", "vel", "ang_vel"):
             values = getattr(state, field)
             if values is not None and not torch.isfinite(values).all():
