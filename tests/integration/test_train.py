@@ -6,27 +6,17 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
-from hydra import compose, initialize_config_dir
 
 from gns_pyg import bundle, run
 from gns_pyg.config import CONF
-from gns_pyg.data.datamodule import DataConfig, split
+from gns_pyg.data.datamodule import EMBEDDED, DataConfig, split
 from gns_pyg.data.trajectory import Trajectory
 from gns_pyg.errors import BundleError, ConfigError, DataError, NumericalError
 from gns_pyg.evaluation.predict import initial_state
 from gns_pyg.scene.scene import Scene
+from tests.integration.runs import config, train
 
 EXPERIMENTS = sorted(path.stem for path in (Path(CONF) / "experiment").glob("*.yaml"))
-TINY = ["model.hidden=8", "training.batch_size=1", "callbacks.rollout_metrics.every_n_updates=1000000", "start_s=1.15"]
-
-
-def config(folder, *overrides, name="train"):
-    with initialize_config_dir(CONF, version_base="1.3"):
-        return compose(name, [f"folder={folder}", *overrides])
-
-
-def train(folder, *overrides):
-    return run.train(config(folder, *TINY, *overrides))
 
 
 def weights(folder):
@@ -41,12 +31,6 @@ def test_every_experiment_composes_and_takes_a_training_step(experiment, tmp_pat
     )
     assert metrics == {}
     assert (tmp_path / "bundle" / "weights.safetensors").is_file()
-
-
-@pytest.fixture(scope="module")
-def trained(tmp_path_factory):
-    folder = tmp_path_factory.mktemp("run")
-    return folder, train(folder, "experiment=hopper", "training.updates=20", "training.unroll_from=0")
 
 
 def test_metrics_are_written_with_units_and_strictly(trained):
@@ -126,7 +110,7 @@ def test_evaluating_the_bundle_gives_the_training_s_metrics(trained, tmp_path):
 
 def test_rollout_is_a_valid_trajectory(trained, tmp_path):
     folder, _ = trained
-    case = Path("data_gen/embedded/hopper_small/case_007.h5")
+    case = EMBEDDED / "hopper_small" / "case_007.h5"
     run.rollout(config(tmp_path, f"bundle={folder / 'bundle'}", f"trajectory={case.resolve()}", name="rollout"))
     written, dem = Trajectory(tmp_path / "rollout.h5"), Trajectory(case)
     assert written.n_frames == dem.n_frames - 10
@@ -135,7 +119,7 @@ def test_rollout_is_a_valid_trajectory(trained, tmp_path):
 
 
 def test_training_never_changes_the_data():
-    case = Path("data_gen/embedded/hopper_small/case_000.h5")
+    case = EMBEDDED / "hopper_small" / "case_000.h5"
     before = case.read_bytes()
     cases = split(Scene.from_config(config("/tmp", "experiment=hopper").scene), DataConfig())
     from gns_pyg.data.windows import Windows
