@@ -89,29 +89,27 @@ def run_dem(
 def _follow(command: list[str], progress: Progress) -> tuple[int, list[str]]:
     """Runs `command` to its end; returns its exit status and its last lines of chatter."""
     tail: deque[str] = deque(maxlen=15)
-    # A session of its own: Ctrl-C reaches this process alone, which then ends Yade.
-    process = subprocess.Popen(
+    popen = subprocess.Popen(
         command,
         stdin=subprocess.DEVNULL,
         stdout=subprocess.PIPE,
         stderr=subprocess.STDOUT,
         text=True,
         errors="replace",
-        start_new_session=True,
+        start_new_session=True,  # Ctrl-C reaches this process alone, which then ends Yade
     )
-    try:
-        assert process.stdout is not None  # PIPE was asked for
-        for line in process.stdout:
-            words = line.split()
-            if words[:1] == ["frame"] and len(words) == 4:
-                progress(int(words[1]), int(words[2]), float(words[3]))
-            elif words:
-                tail.append(line.rstrip())
-        return process.wait(), list(tail)
-    finally:
-        if process.poll() is None:
+    with popen as process:
+        try:
+            for line in process.stdout or ():
+                words = line.split()
+                if words[:1] == ["frame"] and len(words) == 4:
+                    progress(int(words[1]), int(words[2]), float(words[3]))
+                elif words:
+                    tail.append(line.rstrip())
+        except BaseException:
             process.kill()
-            process.wait()
+            raise
+    return process.returncode, list(tail)
 
 
 def clean_stale(path: Path) -> None:

@@ -164,6 +164,7 @@ class TrajectoryWriter:
             maxshape=(None, self._n_grains, 3),
             chunks=(CHUNK_FRAMES, self._n_grains, 3),
             scaleoffset=decimals,  # packs bits, so that shuffling bytes afterwards would only hide repeats from gzip
+            fillvalue=1e30,  # the filter takes values within 10^-decimals of the fill value, 0 by default, for it
             compression="gzip",
             compression_opts=6,
         )
