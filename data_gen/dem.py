@@ -8,6 +8,7 @@ import tempfile
 from collections import deque
 from collections.abc import Callable, Mapping
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from trimesh import Trimesh
@@ -68,7 +69,7 @@ def run_dem(
             "parent": os.getpid(),
         }
         (Path(folder) / "job.json").write_text(json.dumps(job))
-        arrays = {"pos": start.pos, "vel": start.vel, "ang_vel": start.ang_vel}
+        arrays: dict[str, Any] = {"pos": start.pos, "vel": start.vel, "ang_vel": start.ang_vel}
         for name, mesh in meshes.items():
             arrays[f"vertices/{name}"], arrays[f"triangles/{name}"] = np.array(mesh.vertices), np.array(mesh.faces)
         np.savez(Path(folder) / "arrays.npz", **arrays)

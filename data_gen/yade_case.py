@@ -7,6 +7,7 @@ Prints `frame K N SECONDS` after every stored frame; everything else that Yade p
 
 import json
 import os
+import shutil
 import sys
 import time
 from pathlib import Path
@@ -100,6 +101,7 @@ def run(folder: Path) -> None:
     scene, time_s = job["scene"], job["time_s"]
     with np.load(folder / "arrays.npz") as archive:
         arrays = dict(archive)
+    shutil.rmtree(folder, ignore_errors=True)  # all is read; nothing is left over if both processes are killed
     boundary, moving = {}, []
     for name, part in scene["boundary"].items():
         vertices, triangles = arrays[f"vertices/{name}"], arrays[f"triangles/{name}"]

@@ -2,6 +2,7 @@
 
 from dataclasses import dataclass, field
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import trimesh
@@ -115,7 +116,8 @@ def build_mesh(name: str, part: Part) -> Trimesh:
     shape = dict(part.shape)
     kind = shape.pop("kind", None)
     require(kind in SHAPES, f"{where}.kind", kind, " or ".join(SHAPES), "pick one of them")
-    mesh = typed(SHAPES[kind], shape, where).mesh(where)
+    record: Any = typed(SHAPES[kind], shape, where)
+    mesh: Trimesh = record.mesh(where)
     if mesh.is_watertight and mesh.volume < 0:
         mesh.invert()
     return mesh
