@@ -7,6 +7,7 @@ from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import pytorch_lightning as pl
 from torch.utils.data import DataLoader
 
@@ -14,6 +15,7 @@ from gns_pyg.config import flat, require
 from gns_pyg.data.trajectory import Trajectory
 from gns_pyg.data.windows import UpdateSampler, Windows
 from gns_pyg.errors import DataError
+from gns_pyg.scene.containment import outside
 from gns_pyg.scene.scene import Scene
 from gns_pyg.state import Window
 
@@ -87,6 +89,7 @@ def split(scene: Scene, config: DataConfig) -> Split:
     trajectories = [Trajectory(path) for path in find_cases(scene, config.dir)]
     for trajectory in trajectories:
         check_same_scene(trajectory, scene)
+        check_inside(trajectory, scene)
     n_test = math.ceil(config.test_fraction * len(trajectories))
     n_train = len(trajectories) - n_test - config.val_cases
     if n_train < 1:
@@ -117,6 +120,19 @@ def check_same_scene(trajectory: Trajectory, scene: Scene) -> None:
             "; ".join(different),
             f"a case of the scene {scene.name} as configured",
             "choose the scene this file was made from, or generate the cases again",
+        )
+
+
+def check_inside(trajectory: Trajectory, scene: Scene) -> None:
+    """Raises DataError, naming the first, if grains of a case start outside the boundary."""
+    first = trajectory.read("position", 0, 1)
+    out = np.flatnonzero(outside(first, trajectory.times_s[:1], scene)[0])
+    if len(out):
+        raise DataError(
+            trajectory.path,
+            f"{len(out)} grain(s) outside the boundary in the first frame, e.g. grain {out[0]} at {first[0, out[0]]} m",
+            "every grain inside",
+            "correct the scene's boundary, or generate the case again",
         )
 
 

@@ -140,6 +140,7 @@ class TrajectoryWriter:
             grains.create_dataset(name, data=np.asarray(values, np.float64)).attrs["unit"] = FIXED_UNITS[name]
         grains.create_dataset("species", data=np.zeros(len(radius), np.int32))
         self._pending: dict[str, list[np.ndarray]] = {name: [] for name in decimals}
+        self._decimals = dict(decimals)
         self._fields = [name for name in UNITS if name in decimals]
         for name in self._fields:
             self._create_field(grains.create_group(name), UNITS[name], decimals[name])
@@ -190,7 +191,8 @@ class TrajectoryWriter:
                     "lower the time step",
                 )
         for name, values in frame.items():
-            self._pending[name].append(values)
+            # The filter counts its steps from a chunk's smallest value: rounded values keep zero (at rest) zero.
+            self._pending[name].append(np.round(values, self._decimals[name]))
         grains = self._file[GRAINS]
         for name, value in (("step", step), ("time", time_s)):
             grains["position"][name].resize((self._n_frames + 1,))

@@ -52,6 +52,15 @@ def test_what_goes_in_comes_out(tmp_path_factory, n_frames, n_grains, seed) -> N
     assert trajectory.radius.tolist() == [0.01] * n_grains
 
 
+def test_grains_at_rest_and_slow_ones_keep_their_digits(tmp_path) -> None:
+    values = fields(CHUNK_FRAMES + 1, 5)
+    values["velocity"][:, :3] = 0.0
+    values["velocity"][:, 3] = 1.2e-5
+    velocity = Trajectory(write(tmp_path / "case.h5", values)).read("velocity")
+    assert velocity[:, :3] == pytest.approx(0, abs=1e-12)
+    assert velocity[:, 3] == pytest.approx(1e-5, abs=1e-12)
+
+
 def test_a_part_of_the_frames_is_that_part_of_the_whole(good) -> None:
     trajectory = Trajectory(good)
     assert (trajectory.read("velocity", 7, 12) == trajectory.read("velocity")[7:12]).all()
