@@ -71,7 +71,7 @@ def train(cfg: DictConfig) -> dict[str, Any]:
         max_steps=training.updates,
         gradient_clip_val=training.gradient_clip or None,
         logger=instantiate(cfg.logger),
-        callbacks=[instantiate(callback) for callback in cfg.callbacks.values()],
+        callbacks=[instantiate(callback) for callback in cfg.callbacks.values() if callback is not None],
         default_root_dir=folder,
         enable_progress_bar=False,
         enable_model_summary=False,
