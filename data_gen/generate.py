@@ -18,16 +18,14 @@ from omegaconf import DictConfig
 from tqdm import tqdm
 from trimesh import Trimesh
 
-import gns_pyg
 from data_gen.dem import run_dem
 from data_gen.initial import initial_state
-from gns_pyg.config import plain, require
+from gns_pyg.config import CONF, flat, plain, require
 from gns_pyg.data.trajectory import Trajectory
 from gns_pyg.errors import DataError, GnsError
 from gns_pyg.scene.mesh import build_mesh
 from gns_pyg.scene.scene import Scene
 
-CONF = str(Path(gns_pyg.__file__).resolve().parent / "conf")
 READ_LATER = ("cases", "angle_of_repose", "points")  # keys of a scene that do not influence its DEM run
 
 
@@ -83,13 +81,6 @@ def check_finished(path: Path, scene: Scene, meshes: Mapping[str, Trimesh]) -> s
             "delete the file to generate it anew, or choose another folder with out=...",
         )
     return f" (it keeps {'; '.join(differences.values())})" if differences else ""
-
-
-def flat(values: Any, prefix: str = "") -> dict[str, Any]:
-    """Nested mappings as one level of dotted keys."""
-    if not isinstance(values, Mapping):
-        return {prefix: values}
-    return {key: leaf for name in values for key, leaf in flat(values[name], f"{prefix}.{name}".lstrip(".")).items()}
 
 
 def _same_mesh(stored: Mapping[str, Any], mesh: Trimesh) -> bool:
