@@ -48,7 +48,7 @@ def train(cfg: DictConfig) -> dict[str, Any]:
     Returns:
         The metrics that are also written to metrics.json in the run folder.
     """
-    folder = Path(cfg.folder)
+    folder, where = Path(cfg.folder), device(cfg)
     scene = Scene.from_config(cfg.scene)
     training = typed(TrainingConfig, cfg.training, "training")
     data = typed(DataConfig, cfg.data, "data")
@@ -68,6 +68,7 @@ def train(cfg: DictConfig) -> dict[str, Any]:
     quiet_lightning()
     trainer = pl.Trainer(
         **plain(cfg.trainer),
+        accelerator=where.type,
         max_steps=training.updates,
         gradient_clip_val=training.gradient_clip or None,
         logger=instantiate(cfg.logger),
@@ -79,7 +80,7 @@ def train(cfg: DictConfig) -> dict[str, Any]:
     )
     trainer.fit(TrainingModule(simulator, training), datamodule, ckpt_path=cfg.ckpt_path, weights_only=True)
     trainer.save_checkpoint(folder / "checkpoints" / "last.ckpt")
-    return _judge(simulator.eval(), cases, cfg, folder)
+    return _judge(simulator.eval().to(where), cases, cfg, folder)
 
 
 def build(scene: Scene, config: ModelConfig, cases: Split, seed: int) -> Simulator:
@@ -123,13 +124,22 @@ def load_bundle(cfg: DictConfig) -> Simulator:
     require(
         cfg.bundle is not None, "bundle", "null", "a bundle folder", "bundle=runs/.../bundle, as train.py prints it"
     )
-    return bundle.load(cfg.bundle)
+    return bundle.load(cfg.bundle).to(device(cfg))
+
+
+def device(cfg: DictConfig) -> torch.device:
+    """Where to compute: `device` of the config, `auto` being the GPU where there is one."""
+    known = ("auto", "cpu", "cuda")
+    require(cfg.device in known, "device", cfg.device, " or ".join(known), "pick one of them")
+    cuda = torch.cuda.is_available()
+    require(cuda or cfg.device != "cuda", "device", "cuda, but torch finds no GPU", "a GPU", "set device=cpu")
+    return torch.device("cuda" if cuda and cfg.device != "cpu" else "cpu")
 
 
 def write_rollout(simulator: Simulator, trajectory: Trajectory, start: int, path: Path) -> dict[str, Any]:
     """Rolls out from the recorded frame `start` and writes every frame to `path`, in the data's own schema."""
     scene = simulator.scene
-    state = initial_state(simulator, trajectory, start)
+    state = initial_state(simulator, trajectory, start).to(simulator.scale.device)
     fields = (
         scene.dem.decimals
         if state.ang_vel is not None
@@ -141,6 +151,7 @@ def write_rollout(simulator: Simulator, trajectory: Trajectory, start: int, path
         path, asdict(scene), trajectory.radius, trajectory.mass, trajectory.boundary, fields
     ) as writer:
         for step, now in enumerate(itertools.chain([state], rollout_states(simulator, state, n_steps))):
+            now = now.to("cpu")
             spin = None if now.ang_vel is None else now.ang_vel.numpy()
             writer.append(step, float(now.time_s[0]), now.pos.numpy(), now.vel.numpy(), spin)
         wall_clock_s = time.perf_counter() - begin
