@@ -1,0 +1,66 @@
+"""Message passing against the formula written out, and who is left out of it."""
+
+import pytest
+import torch
+
+from gns_pyg.models.contact_network import ContactNetwork
+from gns_pyg.models.interaction import Interaction
+
+WIDTH = 8
+
+
+def test_split_first_layer_is_the_layer_on_the_concatenation():
+    """Equations (7) and (8), written plainly: one product on [receiver, sender, edge], messages summed by a loop."""
+    torch.manual_seed(0)
+    block = Interaction(WIDTH, 3, skip=False).double()
+    receivers, senders = torch.randn(5, WIDTH).double(), torch.randn(4, WIDTH).double()
+    edge_index = torch.tensor([[0, 3, 1, 2, 2], [1, 1, 0, 4, 1]])
+    edges = torch.randn(5, WIDTH).double()
+    weight = torch.cat([block.from_receiver.weight, block.from_sender.weight, block.from_edge.weight], dim=1)
+    joined = torch.cat([receivers[edge_index[1]], senders[edge_index[0]], edges], dim=1)
+    messages = block.message_mlp(torch.relu(joined @ weight.T + block.from_receiver.bias))
+    received = torch.stack([messages[edge_index[1] == i].sum(0) for i in range(5)])
+    expected = block.update_mlp(torch.cat([receivers, received], dim=1))
+    updated, kept = block(senders, receivers, edges, edge_index)
+    assert torch.allclose(updated, expected)
+    assert torch.allclose(kept, messages)
+
+
+def network(**changes):
+    torch.manual_seed(0)
+    sizes = dict(n_sender=None, n_receiver=3, n_edge=2, n_out=3, hidden=WIDTH, layers=2, mlp_layers=2, skip=True)
+    return ContactNetwork(**(sizes | changes))
+
+
+@pytest.mark.parametrize("n_grains", [3, 7])  # with and without isolated grains after the last edge
+def test_grains_without_an_edge_get_exactly_zero_and_change_nothing(n_grains):
+    edge_index = torch.tensor([[0, 2], [2, 0]])
+    grains, edges = torch.randn(n_grains, 3), torch.randn(2, 2)
+    out = network()(None, grains, edges, edge_index)
+    assert out.shape == (n_grains, 3)
+    isolated = [i for i in range(n_grains) if i not in (0, 2)]
+    assert torch.equal(out[isolated], torch.zeros(len(isolated), 3))
+    assert torch.equal(out[:3], network()(None, grains[:3], edges, edge_index))
+
+
+def test_no_edges_give_zeros():
+    none = torch.empty(2, 0, dtype=torch.long)
+    assert torch.equal(network()(None, torch.randn(4, 3), torch.empty(0, 2), none), torch.zeros(4, 3))
+
+
+def test_boundary_points_out_of_reach_change_nothing():
+    points, grains, edges = torch.randn(50, 4), torch.randn(6, 3), torch.randn(3, 2)
+    model = network(n_sender=4)
+    few = model(points[[10, 20]], grains, edges, torch.tensor([[0, 1, 1], [5, 5, 2]]))
+    all_points = model(points, grains, edges, torch.tensor([[10, 20, 20], [5, 5, 2]]))
+    assert torch.equal(few, all_points)
+
+
+def test_edges_carry_from_sender_to_receiver():
+    """Changing a wall point changes only the grains it sends to."""
+    points, grains, edges = torch.randn(2, 4), torch.randn(3, 3), torch.randn(2, 2)
+    edge_index, model = torch.tensor([[0, 1], [2, 1]]), network(n_sender=4)
+    before = model(points, grains, edges, edge_index)
+    points[0] += 1
+    changed = (model(points, grains, edges, edge_index) != before).any(dim=1)
+    assert changed.tolist() == [False, False, True]

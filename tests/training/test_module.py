@@ -1,0 +1,60 @@
+"""Noise, unrolling and schedule of the training module."""
+
+import pytest
+import torch
+
+from gns_pyg.training.config import TrainingConfig
+from gns_pyg.training.module import TrainingModule, perturb
+from tests import scenes
+from tests.simulators import simulator, state_in_box
+
+CONFIG = dict(
+    updates=60,
+    batch_size=1,
+    seed=0,
+    lr_start=1e-4,
+    halvings=5,
+    noise_radii=0.1,
+    noise_velocity=0.1,
+    unroll=4,
+    unroll_from=0.5,
+    gradient_clip=0.0,
+)
+
+
+def module():
+    return TrainingModule(simulator(scenes.scene(20, 5)), TrainingConfig(**CONFIG))
+
+
+def test_noise_is_added_to_a_copy():
+    state, training = state_in_box([20]), module()
+    before = state.pos.clone(), state.vel.clone(), state.ang_vel.clone()
+    noisy = perturb(state, training.config, training.simulator, torch.Generator().manual_seed(0))
+    assert all(torch.equal(a, b) for a, b in zip(before, (state.pos, state.vel, state.ang_vel), strict=True))
+    assert (noisy.pos - state.pos).std().item() == pytest.approx(0.1 * 0.01, rel=0.3)
+    assert (noisy.vel - state.vel).std().item() == pytest.approx(0.1 * 0.5, rel=0.3)
+
+
+def test_learning_rate_ends_at_the_paper_s_value():
+    setup = module().configure_optimizers()
+    optimizer, schedule = setup["optimizer"], setup["lr_scheduler"]["scheduler"]
+    rates = []
+    for _ in range(60):
+        rates.append(optimizer.param_groups[0]["lr"])
+        optimizer.step()
+        schedule.step()
+    assert rates[0] == pytest.approx(1e-4)
+    assert rates[-1] == pytest.approx(3.125e-6)
+    assert len(set(rates)) == 6
+
+
+def test_unrolling_begins_when_told_and_takes_every_length(monkeypatch):
+    training, drawn = module(), {0: [], 1: []}
+    for update in range(60):
+        monkeypatch.setattr(TrainingModule, "global_step", update)
+        drawn[update >= 30] += [
+            training._own_steps(torch.Generator().manual_seed(1000 * update + k)) for k in range(20)
+        ]
+    assert set(drawn[0]) == {0}
+    assert set(drawn[1]) == {0, 1, 2, 3, 4}
+    assert drawn[1].count(0) / len(drawn[1]) == pytest.approx(0.5, abs=0.08)
