@@ -32,6 +32,7 @@ from yade.wrapper import (
 )
 
 sys.path.append(sys.argv[2])  # last: where ROOT is a site-packages folder, numpy and h5py must stay Yade's own
+from gns_pyg import machine
 from gns_pyg.data.trajectory import TrajectoryWriter
 
 
@@ -89,11 +90,6 @@ def steps_per_frame(scene: dict) -> int:
     dt = scene["dem"]["dt_s"]
     longest = utils.PWaveTimeStep() / 3 if dt == "auto" else float(dt)
     return int(np.ceil(scene["frame_dt_s"] / longest * (1 - 1e-9)))
-
-
-def processor() -> str:
-    lines = Path("/proc/cpuinfo").read_text().splitlines() if Path("/proc/cpuinfo").exists() else []
-    return next((line.split(":", 1)[1].strip() for line in lines if line.startswith("model name")), "unknown")
 
 
 def run(folder: Path) -> None:
@@ -160,7 +156,7 @@ def run(folder: Path) -> None:
                 "dt_s": O.dt,
                 "creator": "Yade",
                 "creator_version": str(yade.config.version),
-                "processor": processor(),
+                "processor": machine.processor(),
             }
         )
 

@@ -83,10 +83,8 @@ def load(folder: str | Path) -> Simulator:
     try:
         weights = load_file(path)
         points = {
-            name: BoundaryPoints(
-                weights[f"boundary.parts.{name}.pos"].numpy(), weights[f"boundary.parts.{name}.normal"].numpy()
-            )
-            for name in scene.boundary
+            name: BoundaryPoints(*(weights[f"boundary.parts.{part}.{key}"].numpy() for key in ("pos", "normal")))
+            for part, name in enumerate(scene.boundary)
         }
         simulator = Simulator(
             scene,

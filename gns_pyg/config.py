@@ -1,6 +1,6 @@
 """From plain config values to typed records: every key known, every type checked, one clear error."""
 
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from dataclasses import fields
 from pathlib import Path
 from typing import Any, TypeVar, cast
@@ -41,6 +41,12 @@ def typed(record: type[Record], values: Any, where: str) -> Record:
             f"the keys of {where} are: {known}",
             "correct the key or value; `python train.py --cfg job` prints the whole config",
         ) from None
+
+
+def check_keys(config: Any, known: Iterable[str]) -> None:
+    """Raises ConfigError for a top-level key that is not `known`: Hydra adds whatever +key=value says."""
+    unknown = sorted(set(config) - set(known))
+    require(not unknown, unknown[0] if unknown else "", "not a key", f"one of {', '.join(sorted(known))}", "remove it")
 
 
 def plain(config: Any) -> Any:

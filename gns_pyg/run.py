@@ -1,8 +1,6 @@
 """What the entry points call: each takes the composed config and returns its metrics."""
 
-import itertools
 import logging
-import time
 import warnings
 from collections.abc import Callable
 from dataclasses import asdict
@@ -13,23 +11,24 @@ from typing import Any
 
 import pytorch_lightning as pl
 import torch
-from hydra.errors import CompactHydraException
+from hydra.errors import CompactHydraException, InstantiationException
 from hydra.utils import instantiate
 from omegaconf import DictConfig, OmegaConf
+from pytorch_lightning.utilities.exceptions import MisconfigurationException
 
-from gns_pyg import bundle
-from gns_pyg.config import plain, require, typed
-from gns_pyg.data.datamodule import DataConfig, DataModule, Split, check_same_scene, split
+from gns_pyg import bundle, machine
+from gns_pyg.config import check_keys, flat, plain, require, typed
+from gns_pyg.data.datamodule import DataConfig, DataModule, Split, open_case, open_cases, split
 from gns_pyg.data.statistics import measure
-from gns_pyg.data.trajectory import Trajectory, TrajectoryWriter
+from gns_pyg.data.trajectory import Trajectory
 from gns_pyg.dynamics.integrator import Integrator
 from gns_pyg.dynamics.model_config import ModelConfig
-from gns_pyg.dynamics.rollout import rollout as rollout_states
 from gns_pyg.dynamics.simulator import Simulator
-from gns_pyg.errors import GnsError
-from gns_pyg.evaluation.baselines import FIRST_FRAME, climatology
-from gns_pyg.evaluation.metrics import Evaluation, case_result, evaluate_cases, strict, write_json
-from gns_pyg.evaluation.predict import initial_state, one_step_errors, roll_out, start_frame
+from gns_pyg.errors import ConfigError, GnsError
+from gns_pyg.evaluation.baselines import Climatology, climatology
+from gns_pyg.evaluation.judge import judge
+from gns_pyg.evaluation.metrics import strict, write_json
+from gns_pyg.evaluation.predict import start_frame, write_rollout
 from gns_pyg.report.page import write_page
 from gns_pyg.report.plots import write_plots
 from gns_pyg.report.table import metrics_table
@@ -39,25 +38,26 @@ from gns_pyg.scene.scene import Scene
 from gns_pyg.training.config import TrainingConfig
 from gns_pyg.training.module import TrainingModule
 
+GROUPS = ["scene", "model", "data", "training", "trainer", "callbacks", "logger"]
+TRAIN_KEYS = ["name", "start_s", "ckpt_path", "device", "folder", *GROUPS]
 log = logging.getLogger(__name__)
 
 
 def train(cfg: DictConfig) -> dict[str, Any]:
-    """Trains a simulator on a scene's cases, evaluates it on the unseen ones and saves it as a bundle.
+    """Trains a simulator on a scene's cases, judges it on the unseen ones and saves it as a bundle.
 
     Returns:
         The metrics that are also written to metrics.json in the run folder.
     """
+    check_keys(cfg, TRAIN_KEYS)
     folder, where = Path(cfg.folder), device(cfg)
     scene = Scene.from_config(cfg.scene)
     training = typed(TrainingConfig, cfg.training, "training")
+    model = typed(ModelConfig, cfg.model, "model")
     data = typed(DataConfig, cfg.data, "data")
     cases = split(scene, data)
-    log.info(
-        "%s: %d cases to train on, %d for validation, %d unseen", scene.name, *(len(c) for c in vars(cases).values())
-    )
-    simulator = build(scene, typed(ModelConfig, cfg.model, "model"), cases, training.seed)
-    log.info("model: %d parameters", sum(p.numel() for p in simulator.parameters()))
+    for case in (*cases.val, *cases.test):
+        start_frame(case, cfg.start_s)
     datamodule = DataModule(
         cases,
         length=training.window_length,
@@ -65,22 +65,43 @@ def train(cfg: DictConfig) -> dict[str, Any]:
         seed=training.seed,
         workers=data.workers,
     )
-    quiet_lightning()
-    trainer = pl.Trainer(
-        **plain(cfg.trainer),
-        accelerator=where.type,
-        max_steps=training.updates,
-        gradient_clip_val=training.gradient_clip or None,
-        logger=instantiate(cfg.logger),
-        callbacks=[instantiate(callback) for callback in cfg.callbacks.values() if callback is not None],
-        default_root_dir=folder,
-        enable_progress_bar=False,
-        enable_model_summary=False,
-        log_every_n_steps=50,
+    log.info(
+        "%s: %d cases to train on, %d for validation, %d unseen", scene.name, *(len(c) for c in vars(cases).values())
     )
-    trainer.fit(TrainingModule(simulator, training), datamodule, ckpt_path=cfg.ckpt_path, weights_only=True)
+    simulator = build(scene, model, cases, training.seed)
+    log.info("model: %d parameters", sum(p.numel() for p in simulator.parameters()))
+    identity = flat({"model": asdict(model), "training": asdict(training), "cases": cases.describe()})
+    del identity["training.updates"]  # a run may be lengthened
+    module = TrainingModule(simulator, training, identity)
+    trainer = build_trainer(cfg, training, where)
+    fit(trainer, module, datamodule, cfg.ckpt_path)
     trainer.save_checkpoint(folder / "checkpoints" / "last.ckpt")
-    return _judge(simulator.eval().to(where), cases, cfg, folder)
+    trained = module.judged.eval().to(where)
+    expected = climatology(cases.train, scene)
+    card = {"cases": cases.describe(), "training": plain(cfg.training), "climatology": asdict(expected)}
+    bundle.save(folder / "bundle", trained, strict(card))
+    metrics = report(trained, cases.test, expected, cfg, {"bundle": folder / "bundle"})
+    bundle.save(folder / "bundle", trained, strict(card | {"metrics": metrics}))
+    return metrics
+
+
+def evaluate(cfg: DictConfig) -> dict[str, Any]:
+    """Judges a bundle on the cases of its scene (or of data.dir) that it was not trained or validated on."""
+    simulator, card = load_bundle(cfg), bundle.describe(cfg.bundle)["card"]
+    seen = {digest for purpose in ("train", "val") for digest in card["cases"][purpose].values()}
+    cases = [case for case in open_cases(simulator.scene, cfg.data.dir) if case.content_hash() not in seen]
+    return report(simulator, cases, Climatology.from_plain(card["climatology"]), cfg, {})
+
+
+def rollout(cfg: DictConfig) -> dict[str, Any]:
+    """Rolls a bundle out from a recorded case and writes the trajectory in the data's own format."""
+    simulator = load_bundle(cfg)
+    require(cfg.trajectory is not None, "trajectory", "null", "a case file", "e.g. trajectory=data/hopper/case_016.h5")
+    trajectory = open_case(cfg.trajectory, simulator.scene)
+    path = Path(cfg.folder) / "rollout.h5"
+    seconds = write_rollout(simulator, trajectory, start_frame(trajectory, cfg.start_s), path)
+    log.info("%.3g s per simulated second -> %s", seconds, path)
+    return {"rollout": str(path), "speed/seconds_per_simulated_second": seconds}
 
 
 def build(scene: Scene, config: ModelConfig, cases: Split, seed: int) -> Simulator:
@@ -95,28 +116,47 @@ def build(scene: Scene, config: ModelConfig, cases: Split, seed: int) -> Simulat
         return Simulator(scene, config, points, statistics)
 
 
-def quiet_lightning() -> None:
-    """Lightning's remarks on the machine and its own deprecations are no help to our users."""
-    logging.getLogger("pytorch_lightning").setLevel(logging.WARNING)
-    logging.getLogger("pytorch_lightning.utilities.rank_zero").setLevel(logging.WARNING)
+def build_trainer(cfg: DictConfig, training: TrainingConfig, where: torch.device) -> pl.Trainer:
+    """Lightning's trainer with the config's loggers and callbacks.
+
+    Raises:
+        ConfigError: for keys or values under trainer, logger or callbacks that cannot be built.
+    """
+    for name in ("pytorch_lightning", "pytorch_lightning.utilities.rank_zero"):  # remarks on the machine
+        logging.getLogger(name).setLevel(logging.WARNING)
     warnings.filterwarnings("ignore", message=".*treespec, LeafSpec.*")
     warnings.filterwarnings("ignore", message=".*does not have many workers.*")
+    try:
+        trainer = pl.Trainer(
+            **plain(cfg.trainer),
+            accelerator=where.type,
+            max_steps=training.updates,
+            gradient_clip_val=training.gradient_clip or None,
+            logger=instantiate(cfg.logger),
+            callbacks=[instantiate(callback) for callback in cfg.callbacks.values() if callback is not None],
+            default_root_dir=cfg.folder,
+            enable_progress_bar=False,
+            enable_model_summary=False,
+            log_every_n_steps=50,
+        )
+    except (TypeError, ValueError, InstantiationException, MisconfigurationException) as error:
+        raise ConfigError(
+            "trainer, logger or callbacks",
+            str(error).splitlines()[0],
+            "keys and values of the classes that conf/trainer, conf/logger and conf/callbacks name",
+            "correct or remove the key",
+        ) from None
+    for logger in trainer.loggers:
+        logger.log_hyperparams(flat({key: plain(cfg[key]) for key in ("scene", "model", "training", "data")}))
+    return trainer
 
 
-def evaluate(cfg: DictConfig) -> dict[str, Any]:
-    """Evaluates a bundle on the unseen cases of its scene (or on data.dir)."""
-    simulator = load_bundle(cfg)
-    return _judge(simulator, split(simulator.scene, typed(DataConfig, cfg.data, "data")), cfg, Path(cfg.folder))
-
-
-def rollout(cfg: DictConfig) -> dict[str, Any]:
-    """Rolls a bundle out from a recorded case and writes the trajectory in the data's own format."""
-    simulator, folder = load_bundle(cfg), Path(cfg.folder)
-    require(cfg.trajectory is not None, "trajectory", "null", "a case file", "e.g. trajectory=data/hopper/case_016.h5")
-    trajectory = Trajectory(cfg.trajectory)
-    check_same_scene(trajectory, simulator.scene)
-    start = start_frame(trajectory, cfg.start_s)
-    return write_rollout(simulator, trajectory, start, folder / "rollout.h5")
+def fit(trainer: pl.Trainer, module: TrainingModule, datamodule: DataModule, ckpt_path: str | None) -> None:
+    """Trains, from `ckpt_path` on where it is given."""
+    if ckpt_path is not None:
+        known = "a checkpoint of this model, e.g. runs/.../checkpoints/last.ckpt"
+        require(Path(ckpt_path).is_file(), "ckpt_path", f"{ckpt_path}: no such file", known, "correct the path")
+    trainer.fit(module, datamodule, ckpt_path=ckpt_path, weights_only=True)
 
 
 def load_bundle(cfg: DictConfig) -> Simulator:
@@ -136,52 +176,32 @@ def device(cfg: DictConfig) -> torch.device:
     return torch.device("cuda" if cuda and cfg.device != "cpu" else "cpu")
 
 
-def write_rollout(simulator: Simulator, trajectory: Trajectory, start: int, path: Path) -> dict[str, Any]:
-    """Rolls out from the recorded frame `start` and writes every frame to `path`, in the data's own schema."""
-    scene = simulator.scene
-    state = initial_state(simulator, trajectory, start).to(simulator.scale.device)
-    fields = (
-        scene.dem.decimals
-        if state.ang_vel is not None
-        else {key: scene.dem.decimals[key] for key in ("position", "velocity")}
-    )
-    n_steps = trajectory.n_frames - 1 - start
-    begin = time.perf_counter()
-    with TrajectoryWriter(
-        path, asdict(scene), trajectory.radius, trajectory.mass, trajectory.boundary, fields
-    ) as writer:
-        for step, now in enumerate(itertools.chain([state], rollout_states(simulator, state, n_steps))):
-            now = now.to("cpu")
-            spin = None if now.ang_vel is None else now.ang_vel.numpy()
-            writer.append(step, float(now.time_s[0]), now.pos.numpy(), now.vel.numpy(), spin)
-        wall_clock_s = time.perf_counter() - begin
-        writer.finish(
-            {
-                "wall_clock_s": wall_clock_s,
-                "cores": torch.get_num_threads(),
-                "steps": n_steps,
-                "dt_s": scene.frame_dt_s,
-                "creator": "gns_pyg",
-                "creator_version": version("gns_pyg"),
-                "case": trajectory.path.name,
-            }
-        )
-    log.info("%d steps in %.2f s -> %s", n_steps, wall_clock_s, path)
-    return {"rollout": str(path), "speed/seconds_per_simulated_second": wall_clock_s / (n_steps * scene.frame_dt_s)}
+def report(
+    simulator: Simulator, cases: list[Trajectory], expected: Climatology, cfg: DictConfig, places: dict[str, Path]
+) -> dict[str, Any]:
+    """Judges a simulator on unseen cases; writes metrics.json, cases.json, plots and page; prints the table."""
+    folder, scene = Path(cfg.folder), simulator.scene
+    if not cases:
+        log.info("no unseen case, so nothing to judge the model by")
+        write_json(folder / "metrics.json", {})
+        return {}
+    evaluation = judge(simulator, cases, expected, cfg.start_s)
+    metrics = evaluation.metrics | {"speed/threads": torch.get_num_threads(), "speed/device": device_name(simulator)}
+    write_json(folder / "metrics.json", metrics)
+    write_json(folder / "cases.json", evaluation.per_case)
+    figures = write_plots(evaluation, scene, folder / "plots")
+    title = f"{scene.name}: {len(cases)} unseen cases from {cfg.start_s:g} s on"
+    config = OmegaConf.to_yaml(cfg, resolve=True)
+    write_page(folder / "report.html", title, metrics, figures, scene, config, versions(cases[0]))
+    places = {"run folder": folder, **places, "plots": folder / "plots", "report": folder / "report.html"}
+    log.info("\n%s", metrics_table(metrics, title, places))
+    return metrics
 
 
-def judge(simulator: Simulator, cases: Split, start_s: float) -> Evaluation | None:
-    """Rolls the unseen cases out and compares them with DEM; None where there is no unseen case."""
-    if not cases.test:
-        return None
-    results = []
-    for case in cases.test:
-        start = start_frame(case, start_s)
-        pos, seconds = roll_out(simulator, case, start)
-        results.append(
-            case_result(case, simulator.scene, pos, start, one_step_errors(simulator, case), FIRST_FRAME, seconds)
-        )
-    return evaluate_cases(results, climatology(cases.train, simulator.scene), simulator.scene)
+def device_name(simulator: Simulator) -> str:
+    """The GPU or processor that a simulator computes on."""
+    where = simulator.scale.device
+    return torch.cuda.get_device_name(where) if where.type == "cuda" else machine.processor()
 
 
 def versions(case: Trajectory) -> dict[str, str]:
@@ -201,24 +221,3 @@ def entry(function: Callable[[DictConfig], dict[str, Any]]) -> Callable[[DictCon
             raise CompactHydraException(f"{type(error).__name__}: {error}") from None  # printed without a traceback
 
     return run
-
-
-def _judge(simulator: Simulator, cases: Split, cfg: DictConfig, folder: Path) -> dict[str, Any]:
-    """Evaluates, draws, prints, and writes metrics.json, the report and (after training) the bundle."""
-    scene, places = simulator.scene, {"run folder": folder}
-    evaluation = judge(simulator, cases, cfg.start_s)
-    metrics = evaluation.metrics if evaluation else {}
-    if "model" in cfg:
-        card = {"cases": cases.describe(), "training": plain(cfg.training), "metrics": metrics}
-        places["bundle"] = bundle.save(folder / "bundle", simulator, strict(card))
-    write_json(folder / "metrics.json", metrics)
-    if evaluation is None:
-        log.info("no unseen case, so nothing to judge the model by (data.test_fraction=0)")
-        return metrics
-    figures = write_plots(evaluation, scene, folder / "plots")
-    places |= {"plots": folder / "plots", "report": folder / "report.html"}
-    title = f"{scene.name}: {len(cases.test)} unseen cases from {cfg.start_s:g} s on"
-    config = OmegaConf.to_yaml(cfg, resolve=True)
-    write_page(folder / "report.html", title, metrics, figures, scene, config, versions(cases.test[0]))
-    log.info("\n%s", metrics_table(metrics, title, places))
-    return metrics

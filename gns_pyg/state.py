@@ -64,7 +64,6 @@ class Window(Record):
         radius: grain radius, m, float64.
         time_s: time of frame 0 of each graph, s.
         batch: graph of each grain, sorted.
-        frame_dt_s: time between frames, s.
     """
 
     pos: Float[Tensor, "n_frames n_grains 3"]
@@ -73,7 +72,6 @@ class Window(Record):
     radius: Float[Tensor, " n_grains"]
     time_s: Float[Tensor, " n_graphs"]
     batch: Int[Tensor, " n_grains"]
-    frame_dt_s: float
 
     @staticmethod
     def collate(windows: "list[Window]") -> "Window":
@@ -86,7 +84,6 @@ class Window(Record):
             radius=torch.cat([w.radius for w in windows]),
             time_s=torch.cat([w.time_s for w in windows]),
             batch=torch.repeat_interleave(torch.arange(len(windows)), sizes),
-            frame_dt_s=windows[0].frame_dt_s,
         )
 
 

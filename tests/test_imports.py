@@ -6,8 +6,8 @@ from pathlib import Path
 import pytest
 
 PACKAGE = Path(__file__).parents[1] / "gns_pyg"
-GROUND = {"errors", "config", "state"}
-BELOW = {"errors": set(), "config": {"errors"}, "state": {"errors"}}
+GROUND = {"errors", "config", "state", "machine"}
+BELOW = {"errors": set(), "machine": set(), "config": {"errors"}, "state": {"errors"}}
 BELOW |= {room: {room} | GROUND for room in ("models", "scene", "graph")}
 BELOW["dynamics"] = {"dynamics", "models", "scene", "graph"} | GROUND
 BELOW["data"] = {"data"} | BELOW["dynamics"]

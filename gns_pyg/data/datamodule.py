@@ -80,16 +80,30 @@ def find_cases(scene: Scene, folder: str | None) -> list[Path]:
     )
 
 
+def open_case(path: str | Path, scene: Scene) -> Trajectory:
+    """Opens a case and checks it.
+
+    Raises:
+        DataError: if it is damaged, of another scene, or starts with a grain outside the boundary.
+    """
+    trajectory = Trajectory(path)
+    check_same_scene(trajectory, scene)
+    check_inside(trajectory, scene)
+    return trajectory
+
+
+def open_cases(scene: Scene, folder: str | None) -> list[Trajectory]:
+    """Opens and checks all cases of a scene (see `find_cases`, `open_case`)."""
+    return [open_case(path, scene) for path in find_cases(scene, folder)]
+
+
 def split(scene: Scene, config: DataConfig) -> Split:
     """Opens, checks and splits the cases of a scene.
 
     Raises:
-        DataError: if a case is damaged or of another scene, or if too few are left to train on.
+        DataError: if a case cannot be used (see `open_case`), or if too few are left to train on.
     """
-    trajectories = [Trajectory(path) for path in find_cases(scene, config.dir)]
-    for trajectory in trajectories:
-        check_same_scene(trajectory, scene)
-        check_inside(trajectory, scene)
+    trajectories = open_cases(scene, config.dir)
     n_test = math.ceil(config.test_fraction * len(trajectories))
     n_train = len(trajectories) - n_test - config.val_cases
     if n_train < 1:

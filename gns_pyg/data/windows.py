@@ -22,7 +22,6 @@ def read_window(trajectory: Trajectory, start: int, length: int) -> Window:
         radius=torch.from_numpy(trajectory.radius),
         time_s=torch.tensor([trajectory.times_s[start]], dtype=torch.float64),
         batch=torch.zeros(trajectory.n_grains, dtype=torch.long),
-        frame_dt_s=trajectory.frame_dt_s,
     )
 
 

@@ -61,13 +61,13 @@ class Boundary(nn.Module):
 
     def __init__(self, scene: Scene, points: Mapping[str, BoundaryPoints], neighbors: str) -> None:
         super().__init__()
-        self.parts = nn.ModuleDict(
-            {name: BoundaryPart(points[name], part.motion, neighbors) for name, part in scene.boundary.items()}
+        self.parts = nn.ModuleList(
+            BoundaryPart(points[name], part.motion, neighbors) for name, part in scene.boundary.items()
         )
         self.moves = any(part.motion.moves for part in scene.boundary.values())
 
     def __iter__(self) -> Iterator[BoundaryPart]:
-        return iter(cast(Iterable[BoundaryPart], self.parts.values()))
+        return iter(cast(Iterable[BoundaryPart], self.parts))
 
     def at(self, time_s: Float[Tensor, " b"]) -> Walls:
         """The boundary of every graph at its time."""

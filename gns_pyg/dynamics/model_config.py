@@ -1,5 +1,6 @@
 """The choices that make a model; conf/model/*.yaml are its files."""
 
+import math
 from dataclasses import dataclass
 
 from omegaconf import MISSING
@@ -39,7 +40,7 @@ class ModelConfig:
     def __post_init__(self) -> None:
         for key in ("cutoff_grain_radii", "cutoff_wall_radii"):
             value = getattr(self, key)
-            require(value > 0, f"model.{key}", value, "above 0", "2.5 is the paper's")
+            require(0 < value < math.inf, f"model.{key}", value, "above 0 and finite", "2.5 is the paper's")
         for key, least in (("hidden", 1), ("layers", 1), ("mlp_layers", 2)):
             value = getattr(self, key)
             require(value >= least, f"model.{key}", value, f"at least {least}", f"set model.{key} to {least} or more")

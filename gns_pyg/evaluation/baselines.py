@@ -5,6 +5,7 @@ A network that does not beat these has learned nothing; every error is reported 
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 import torch
@@ -79,6 +80,12 @@ class Climatology:
     times_s: np.ndarray
     center_of_mass_m: np.ndarray
     angle_of_repose_deg: np.ndarray | None
+
+    @staticmethod
+    def from_plain(values: Mapping[str, Any]) -> "Climatology":
+        """Reads one stored as plain lists (`evaluation.metrics.strict(asdict(...))`); null is nan."""
+        curves = {key: None if curve is None else np.array(curve, np.float64) for key, curve in values.items()}
+        return Climatology(**curves)  # type: ignore[arg-type]
 
     def center_of_mass_at(self, times_s: np.ndarray) -> np.ndarray:
         """The mean curve at `times_s` (n,), (n, 3), m; linear between frames, held beyond the last."""

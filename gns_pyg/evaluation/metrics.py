@@ -218,7 +218,7 @@ def evaluate_cases(results: Sequence[CaseResult], climatology: Climatology, scen
         DataError: if there is no test case.
     """
     if not results:
-        raise DataError("test cases", "none", "at least one", "set data.test_cases to 1 or more")
+        raise DataError("test cases", "none", "at least one", "raise data.test_fraction")
     trivial_name, trivial = best_trivial([result.trivial_error_m for result in results])
     cases = [_evaluate_case(result, trivial_name, climatology, scene) for result in results]
     metrics: dict[str, Any] = {}

@@ -159,7 +159,7 @@ def _surface(x: np.ndarray, y: np.ndarray, height: np.ndarray, radius: float) ->
     cells = np.floor(np.stack([x, y], axis=1) / (CELL_DIAMETERS * 2 * radius))
     cell = np.unique(cells, axis=0, return_inverse=True)[1].reshape(-1)
     order = np.lexsort((height, cell))
-    return order[np.append(np.diff(cell[order]) > 0, True)]
+    return order[np.append(np.diff(cell[order]) > 0, True)[: len(order)]]
 
 
 def _slope(coordinate: np.ndarray, height: np.ndarray, radius: float) -> float:

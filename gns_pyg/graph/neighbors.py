@@ -29,11 +29,11 @@ class Backend:
     name: str
     build: Callable[[Float[Tensor, "n 3"], Int[Tensor, " n"]], Index]
     cpu: bool
-    cuda: bool
+    cuda: Callable[[], bool]
     package: str | None = None
 
     def available(self, device: torch.device) -> bool:
-        runs = self.cuda if device.type == "cuda" else self.cpu
+        runs = self.cuda() if device.type == "cuda" else self.cpu
         return runs and (self.package is None or find_spec(self.package) is not None)
 
 
@@ -155,11 +155,20 @@ def _torch_cluster(points: Tensor, point_batch: Tensor) -> Index:
     return index
 
 
+def _torch_cluster_has_cuda() -> bool:
+    """torch_cluster may be installed without its CUDA kernels."""
+    if find_spec("torch_cluster") is None:
+        return False
+    import torch_cluster  # noqa: F401  registers the operator asked for here
+
+    return torch.ops.torch_cluster.cuda_version() >= 0
+
+
 BACKENDS = {
     b.name: b
     for b in (
-        Backend("kdtree", _kdtree, cpu=True, cuda=False),
-        Backend("torch_cluster", _torch_cluster, cpu=True, cuda=True, package="torch_cluster"),
-        Backend("grid", _grid, cpu=True, cuda=True),
+        Backend("kdtree", _kdtree, cpu=True, cuda=lambda: False),
+        Backend("torch_cluster", _torch_cluster, cpu=True, cuda=_torch_cluster_has_cuda, package="torch_cluster"),
+        Backend("grid", _grid, cpu=True, cuda=lambda: True),
     )
 }

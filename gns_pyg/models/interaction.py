@@ -30,6 +30,8 @@ class Interaction(MessagePassing):
         self.from_receiver = nn.Linear(hidden, hidden)
         self.from_sender = nn.Linear(hidden, hidden, bias=False)
         self.from_edge = nn.Linear(hidden, hidden, bias=False)
+        for part in (self.from_receiver, self.from_sender, self.from_edge):
+            nn.init.uniform_(part.weight, -((3 * hidden) ** -0.5), (3 * hidden) ** -0.5)  # as one layer of 3 x hidden
         self.message_mlp = mlp(hidden, hidden, hidden, mlp_layers - 1, layer_norm=skip)
         self.update_mlp = mlp(2 * hidden, hidden, hidden, mlp_layers, layer_norm=skip)
 

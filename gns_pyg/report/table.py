@@ -70,6 +70,7 @@ def metric_rows(metrics: Mapping[str, Any]) -> list[tuple[str, str, str]]:
     factor = ""
     if own is not None and yade is not None and own > 0:
         factor = f", network {yade / own:.3g} times as fast"
+    threads = f" (on {_count(metrics['speed/threads'])} threads)" if "speed/threads" in metrics else ""
     cores, yade_dt = (
         _count(metrics.get("speed/yade_cores")),
         _number(metrics.get("speed/yade_dt_s"), 1e6, " \N{MICRO SIGN}s"),
@@ -84,7 +85,8 @@ def metric_rows(metrics: Mapping[str, Any]) -> list[tuple[str, str, str]]:
         (
             "time per simulated second",
             _number(own, 1.0, " s"),
-            f"{_number(yade, 1.0, ' s')} Yade (dt {yade_dt}, {cores} core{'' if cores == '1' else 's'}){factor}",
+            f"{_number(yade, 1.0, ' s')} Yade (dt {yade_dt}, {cores} core{'' if cores == '1' else 's'})"
+            f"{factor}{threads}",
         ),
     ]
     return rows

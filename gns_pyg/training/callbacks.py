@@ -3,18 +3,22 @@
 import logging
 import sys
 import time
+from pathlib import Path
 from typing import cast
 
 import numpy as np
 import pytorch_lightning as pl
 from tqdm import tqdm
 
+from gns_pyg.config import require
 from gns_pyg.data.trajectory import Trajectory
 from gns_pyg.dynamics.simulator import Simulator
 from gns_pyg.errors import NumericalError
 from gns_pyg.evaluation import observables
 from gns_pyg.evaluation.errors import position_error
+from gns_pyg.evaluation.metrics import write_json
 from gns_pyg.evaluation.predict import one_step_errors, roll_out, start_frame
+from gns_pyg.training.module import TrainingModule
 
 log = logging.getLogger(__name__)
 
@@ -44,36 +48,54 @@ class Progress(pl.Callback):
 
 
 class RolloutMetrics(pl.Callback):
-    """Rolls out the validation cases and logs what an engineer would look at.
+    """Rolls out the validation cases and logs what an engineer would look at, `val/...`, mean over cases.
+
+    The curves behind the figures go to validation/update_<n>.json in the run folder.
 
     Args:
-        every_n_updates: how often.
+        every_n_updates: how often; the last update counts too.
         start_s: where roll-outs begin, s.
     """
 
     def __init__(self, every_n_updates: int, start_s: float) -> None:
+        key = "callbacks.rollout_metrics.every_n_updates"
+        require(every_n_updates > 0, key, every_n_updates, "at least 1", "e.g. 1000")
         self.every_n_updates, self.start_s = every_n_updates, start_s
 
     def on_train_batch_end(self, trainer: pl.Trainer, module: pl.LightningModule, outputs, batch, batch_idx) -> None:
-        if trainer.global_step % self.every_n_updates == 0:
-            cases = trainer.datamodule.cases.val  # type: ignore[attr-defined]
-            found = [rollout_metrics(cast(Simulator, module.simulator), case, self.start_s) for case in cases]
-            for key in found[0] if found else ():
-                module.log(f"val/{key}", float(np.mean([metrics[key] for metrics in found])), batch_size=len(cases))
+        update = trainer.global_step
+        cases = trainer.datamodule.cases.val  # type: ignore[attr-defined]
+        if not cases or (update % self.every_n_updates and update < trainer.max_steps):
+            return
+        found = [rollout_metrics(cast(TrainingModule, module).judged, case, self.start_s) for case in cases]
+        metrics = {key: float(np.mean([figures[key] for figures, _ in found])) for key in found[0][0]}
+        for logger in trainer.loggers:
+            logger.log_metrics({f"val/{key}": value for key, value in metrics.items()}, step=update)
+        curves = {case.path.stem: of_case for case, (_, of_case) in zip(cases, found, strict=True)}
+        write_json(Path(trainer.default_root_dir) / "validation" / f"update_{update:06d}.json", curves)
 
 
-def rollout_metrics(simulator: Simulator, case: Trajectory, start_s: float) -> dict[str, float]:
-    """One validation roll-out; a diverging one (early in training) counts as infinitely wrong, not as a crash."""
+def rollout_metrics(
+    simulator: Simulator, case: Trajectory, start_s: float
+) -> tuple[dict[str, float], dict[str, np.ndarray]]:
+    """Figures and curves of one validation roll-out.
+
+    One that diverges (early in training) counts as infinitely wrong, not as a crash: its figures are infinite and it
+    has no curves.
+    """
     start = start_frame(case, start_s)
     scene, dem, times = simulator.scene, case.read("position", start), case.times_s[start:]
     metrics = {"one_step_error_m": float(one_step_errors(simulator, case).mean())}
+    diverged = ["rollout_error_final_m", "center_of_mass_error_max_m", "mean_overlap_ratio", "escaped_grains"]
+    diverged += ["angle_of_repose_error_deg"] if scene.angle_of_repose is not None else []
     try:
         pos, _ = roll_out(simulator, case, start)
     except NumericalError:
-        return {**metrics, "rollout_error_final_m": float("inf")}
+        return metrics | dict.fromkeys(diverged, float("inf")), {}
     com, com_dem = (observables.center_of_mass(p, case.mass) for p in (pos, dem))
+    error = position_error(pos, dem)
     metrics |= {
-        "rollout_error_final_m": float(position_error(pos, dem)[-1]),
+        "rollout_error_final_m": float(error[-1]),
         "center_of_mass_error_max_m": float(np.linalg.norm(com - com_dem, axis=1).max()),
         "mean_overlap_ratio": float(observables.mean_overlap_ratio(pos, case.radius).mean()),
         "escaped_grains": float(observables.escaped_grains(pos, times, scene).max()),
@@ -81,4 +103,4 @@ def rollout_metrics(simulator: Simulator, case: Trajectory, start_s: float) -> d
     if scene.angle_of_repose is not None:
         angle, angle_dem = (observables.mean_angle_of_repose(p, times, scene)[0] for p in (pos, dem))
         metrics["angle_of_repose_error_deg"] = abs(angle - angle_dem)
-    return metrics
+    return metrics, {"time_s": times, "error_m": error, "center_of_mass_m": com, "center_of_mass_dem_m": com_dem}

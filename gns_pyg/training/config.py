@@ -22,6 +22,7 @@ class TrainingConfig:
         unroll: half of the updates start from up to this many of the model's own steps; 0 is one-step training.
         unroll_from: share of the updates after which unrolling begins.
         gradient_clip: largest gradient norm; 0 is no limit.
+        average_decay: the weights' exponential moving average with this decay is what is judged and saved; 0 is none.
     """
 
     updates: int = MISSING
@@ -34,11 +35,17 @@ class TrainingConfig:
     unroll: int = MISSING
     unroll_from: float = MISSING
     gradient_clip: float = MISSING
+    average_decay: float = MISSING
 
     def __post_init__(self) -> None:
         for key in ("updates", "batch_size", "lr_start"):
             value = getattr(self, key)
             require(value > 0, f"training.{key}", value, "above 0", f"set training.{key} above 0")
+        for key in ("seed", "halvings", "noise_radii", "noise_velocity", "unroll", "unroll_from", "gradient_clip"):
+            value = getattr(self, key)
+            require(value >= 0, f"training.{key}", value, "at least 0", f"training.{key}=0 turns it off")
+        decay = self.average_decay
+        require(0 <= decay < 1, "training.average_decay", decay, "0 up to below 1", "e.g. 0.998; 0 is no averaging")
 
     @property
     def window_length(self) -> int:

@@ -1,14 +1,17 @@
 """What Lightning drives: one update of a simulator."""
 
+from collections.abc import Mapping
 from dataclasses import replace
+from typing import Any, cast
 
 import pytorch_lightning as pl
 import torch
 from pytorch_lightning.utilities.types import OptimizerLRScheduler
 from torch import Tensor
+from torch.optim.swa_utils import AveragedModel, get_ema_multi_avg_fn
 
 from gns_pyg.dynamics.simulator import Simulator
-from gns_pyg.errors import NumericalError
+from gns_pyg.errors import ConfigError, NumericalError
 from gns_pyg.state import State, Window
 from gns_pyg.training.config import TrainingConfig
 
@@ -19,13 +22,46 @@ class TrainingModule(pl.LightningModule):
     The loss is the mean square of the scaled correction's error: for position-only states the paper's (12) up to a
     constant factor. Noise and unrolling are drawn from the seed and the update's number, so a resumed run
     repeats none and skips none.
+
+    Args:
+        simulator: what is trained.
+        config: how.
+        identity: what a checkpoint must agree on to be resumed from: dotted keys -> plain values.
     """
 
-    def __init__(self, simulator: Simulator, config: TrainingConfig) -> None:
+    def __init__(self, simulator: Simulator, config: TrainingConfig, identity: Mapping[str, Any] | None = None) -> None:
         super().__init__()
-        self.simulator, self.config = simulator, config
+        self.simulator, self.config, self.identity = simulator, config, dict(identity or {})
+        self.average: AveragedModel | None = None
+        if config.average_decay:
+            self.average = AveragedModel(simulator, multi_avg_fn=get_ema_multi_avg_fn(config.average_decay))
+            self.average.requires_grad_(False)
 
-    def training_step(self, window: Window, _: int) -> Tensor:
+    @property
+    def judged(self) -> Simulator:
+        """The simulator that is evaluated and saved: the averaged one where there is one."""
+        return self.simulator if self.average is None else cast(Simulator, self.average.module)
+
+    def on_train_batch_end(self, outputs: Any, batch: Window, batch_idx: int) -> None:
+        if self.average is not None:
+            self.average.update_parameters(self.simulator)
+
+    def on_save_checkpoint(self, checkpoint: dict[str, Any]) -> None:
+        checkpoint["identity"] = self.identity
+
+    def on_load_checkpoint(self, checkpoint: dict[str, Any]) -> None:
+        """Refuses a checkpoint of another model, data set or way of training, naming the differences."""
+        then, now = checkpoint.get("identity", {}), self.identity
+        keys = [key for key in sorted({*then, *now}) if then.get(key) != now.get(key)]
+        if keys:
+            raise ConfigError(
+                "ckpt_path",
+                "; ".join(f"{key} = {then.get(key)}" for key in keys),
+                "; ".join(f"{key} = {now.get(key)}" for key in keys),
+                "resume with the config and data of the checkpoint, or start anew without ckpt_path",
+            )
+
+    def training_step(self, window: Window, batch_idx: int) -> Tensor:
         random = torch.Generator().manual_seed(self.config.seed * 1_000_003 + self.global_step)
         state, frame = self.simulator.integrator.read(window, 1), 1
         state = perturb(state, self.config, self.simulator, random)
@@ -39,7 +75,7 @@ class TrainingModule(pl.LightningModule):
                 f"training update {self.global_step}",
                 f"loss {loss.item()}",
                 "a finite loss",
-                "lower training.lr_start or training.unroll; the last checkpoint is in the run folder",
+                "lower training.lr_start or training.unroll; checkpoints/ holds the last state saved before, if any",
             )
         self.log("train/loss", loss, batch_size=state.n_graphs)
         return loss

@@ -1,6 +1,9 @@
 """The whole way through the house, in process, at a tiny size and on the embedded real data."""
 
 import json
+import shutil
+import subprocess
+import sys
 from pathlib import Path
 
 import numpy as np
@@ -13,9 +16,11 @@ from gns_pyg.data.datamodule import EMBEDDED, DataConfig, split
 from gns_pyg.data.trajectory import Trajectory
 from gns_pyg.errors import BundleError, ConfigError, DataError, NumericalError
 from gns_pyg.evaluation.predict import initial_state
-from gns_pyg.scene.scene import Scene
+from gns_pyg.training import callbacks
+from gns_pyg.training.module import TrainingModule
 from tests.integration.runs import config, train
 
+ROOT = Path(__file__).parents[2]
 EXPERIMENTS = sorted(path.stem for path in (Path(CONF) / "experiment").glob("*.yaml"))
 
 
@@ -66,8 +71,6 @@ def test_resuming_equals_one_shot(trained, tmp_path):
     class Stop(Exception):
         pass
 
-    from gns_pyg.training.module import TrainingModule
-
     original = TrainingModule.training_step
 
     def interrupted(self, window, index):
@@ -85,12 +88,13 @@ def test_resuming_equals_one_shot(trained, tmp_path):
 
 
 def test_bundle_equals_checkpoint(trained):
-    folder, _ = trained
-    checkpoint = torch.load(folder / "checkpoints" / "last.ckpt", weights_only=True)
-    stored = weights(folder)
-    for key, value in checkpoint["state_dict"].items():
-        name = key.removeprefix("simulator.")
-        assert name not in stored or torch.equal(stored[name], value)
+    """The bundle holds the averaged weights of the last checkpoint."""
+    checkpoint = torch.load(trained[0] / "checkpoints" / "last.ckpt", weights_only=True)["state_dict"]
+    stored, prefix = weights(trained[0]), "average.module."
+    averaged = {key.removeprefix(prefix): value for key, value in checkpoint.items() if key.startswith(prefix)}
+    assert averaged.keys() == stored.keys()
+    assert all(torch.equal(averaged[key], stored[key]) for key in stored)
+    assert any(not torch.equal(checkpoint[f"simulator.{key}"], stored[key]) for key in stored)
 
 
 def test_bundle_predicts_what_the_trained_model_predicts(trained, tmp_path):
@@ -118,21 +122,90 @@ def test_rollout_is_a_valid_trajectory(trained, tmp_path):
     assert written.times_s[0] == pytest.approx(0.1)
 
 
-def test_training_never_changes_the_data():
-    case = EMBEDDED / "hopper_small" / "case_000.h5"
-    before = case.read_bytes()
-    cases = split(Scene.from_config(config("/tmp", "experiment=hopper").scene), DataConfig())
-    from gns_pyg.data.windows import Windows
+def test_training_never_changes_the_data(tmp_path, monkeypatch):
+    """Noise and unrolling of a few updates leave the file and the window that was handed out as they were."""
+    held, case = [], EMBEDDED / "hopper_small" / "case_000.h5"
+    before, original = case.read_bytes(), TrainingModule.training_step
 
-    first = Windows(cases.train, 3)[5].pos.clone()
-    second = Windows(cases.train, 3)[5].pos
-    assert torch.equal(first, second)
+    def keeping(self, window, index):
+        copy = window.pos.clone(), window.vel.clone(), window.ang_vel.clone()
+        loss = original(self, window, index)
+        held.append(all(torch.equal(a, b) for a, b in zip(copy, (window.pos, window.vel, window.ang_vel), strict=True)))
+        return loss
+
+    monkeypatch.setattr(TrainingModule, "training_step", keeping)
+    noise = ["training.noise_radii=0.5", "training.noise_velocity=0.5", "training.unroll_from=0"]
+    train(tmp_path, "experiment=hopper", "training.updates=6", "data.test_fraction=0", *noise)
+    assert held == [True] * 6
     assert case.read_bytes() == before
 
 
-def test_a_bundle_of_another_format_version_is_refused(trained, tmp_path):
-    import shutil
+def test_evaluation_leaves_out_what_was_trained_on(tmp_path):
+    train(tmp_path / "a", "experiment=hopper", "training.updates=1", "data.test_fraction=0", "data.val_cases=0")
+    assert run.evaluate(config(tmp_path / "b", f"bundle={tmp_path / 'a' / 'bundle'}", name="evaluate")) == {}
 
+
+def test_a_checkpoint_of_another_config_is_refused_with_the_difference(trained, tmp_path):
+    checkpoint = trained[0] / "checkpoints" / "last.ckpt"
+    with pytest.raises(ConfigError, match="model.hidden = 8"):
+        train(tmp_path, "experiment=hopper", f"ckpt_path={checkpoint}", "model.hidden=4")
+    with pytest.raises(ConfigError, match="no such file"):
+        train(tmp_path, "experiment=hopper", "ckpt_path=nowhere.ckpt")
+
+
+def test_a_run_can_be_lengthened(tmp_path):
+    """20 updates, then on to 30, equal 30 in one go where the learning rate does not depend on the number."""
+    overrides = ["experiment=hopper", "data.test_fraction=0", "training.halvings=0", "training.unroll_from=0"]
+    train(tmp_path / "short", *overrides, "training.updates=4")
+    checkpoint = tmp_path / "short" / "checkpoints" / "last.ckpt"
+    train(tmp_path / "long", *overrides, "training.updates=8", f"ckpt_path={checkpoint}")
+    train(tmp_path / "once", *overrides, "training.updates=8")
+    one, two = weights(tmp_path / "long"), weights(tmp_path / "once")
+    assert all(torch.equal(one[key], two[key]) for key in one)
+
+
+def test_a_diverging_validation_roll_out_is_a_figure_not_a_crash(tmp_path, monkeypatch):
+    def diverge(*_):
+        raise NumericalError("roll-out step 3", "nan", "finite values", "train longer")
+
+    monkeypatch.setattr(callbacks, "roll_out", diverge)
+    target = "{_target_: gns_pyg.training.callbacks.RolloutMetrics, every_n_updates: 2, start_s: 1.15}"
+    often = [f"callbacks.rollout_metrics={target}", "data.val_cases=2"]
+    train(tmp_path, "experiment=hopper", "training.updates=3", "data.test_fraction=0", *often)
+    rows = [line for line in (tmp_path / "log" / "metrics.csv").read_text().splitlines() if "inf" in line]
+    assert len(rows) == 2  # after updates 2 and 3
+
+
+@pytest.mark.parametrize("logger", ["wandb", "tensorboard"])
+def test_loggers_need_no_account(logger, tmp_path, monkeypatch):
+    monkeypatch.setenv("WANDB_MODE", "offline")
+    monkeypatch.setenv("WANDB_SILENT", "true")
+    train(tmp_path, "experiment=hopper", f"logger={logger}", "training.updates=1", "data.test_fraction=0")
+    assert (tmp_path / logger).is_dir(), list(tmp_path.iterdir())
+
+
+def command(*arguments):
+    words = [sys.executable, *arguments]
+    return subprocess.run(words, cwd=ROOT, capture_output=True, text=True, timeout=300, check=False)
+
+
+def test_a_sweep_runs_every_job(tmp_path):
+    sweep = ["-m", "experiment=hopper", "model.hidden=4,8", "training.updates=1", "start_s=1.15"]
+    done = command("train.py", *sweep, f"hydra.sweep.dir={tmp_path}")
+    assert done.returncode == 0, done.stderr
+    hidden = [json.loads((tmp_path / job / "bundle" / "bundle.json").read_text())["model"]["hidden"] for job in "01"]
+    assert hidden == [4, 8]
+    assert all((tmp_path / job / "metrics.json").is_file() for job in "01")
+
+
+def test_the_command_line_ends_with_a_message_and_status_1(tmp_path):
+    done = command("train.py", "experiment=hopper", "scene.grains.radius_m=-1", f"hydra.run.dir={tmp_path}")
+    assert done.returncode == 1
+    assert "remedy" in done.stderr
+    assert "Traceback" not in done.stderr
+
+
+def test_a_bundle_of_another_format_version_is_refused(trained, tmp_path):
     shutil.copytree(trained[0] / "bundle", tmp_path / "bundle")
     path = tmp_path / "bundle" / "bundle.json"
     path.write_text(path.read_text().replace('"format_version": 1', '"format_version": 99'))
@@ -141,8 +214,6 @@ def test_a_bundle_of_another_format_version_is_refused(trained, tmp_path):
 
 
 def test_damaged_weights_are_refused(trained, tmp_path):
-    import shutil
-
     shutil.copytree(trained[0] / "bundle", tmp_path / "bundle")
     path = tmp_path / "bundle" / "weights.safetensors"
     path.write_bytes(path.read_bytes()[:1000])
@@ -169,6 +240,15 @@ def test_non_finite_loss_stops_with_the_update_named(tmp_path):
         ("scene.damping=0.5", DataError, "damping"),
         ("data.val_cases=9", DataError, "data.val_cases"),
         ("model.neighbors=octree", ConfigError, "octree"),
+        ("data.val_cases=-1", ConfigError, "data.val_cases"),
+        ("training.halvings=-1", ConfigError, "training.halvings"),
+        ("training.unroll=-1", ConfigError, "training.unroll"),
+        ("start_s=abc", ConfigError, "start_s"),
+        ("start_s=99", DataError, "start_s"),
+        ("+foo=3", ConfigError, "foo"),
+        ("+trainer.presision=16", ConfigError, "presision"),
+        ("+callbacks.progress.evry=3", ConfigError, "evry"),
+        ("device=tpu", ConfigError, "device"),
     ],
 )
 def test_bad_config_is_one_clear_error_and_leaves_no_output(override, error, match, tmp_path):

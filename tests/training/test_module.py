@@ -19,6 +19,7 @@ CONFIG = dict(
     unroll=4,
     unroll_from=0.5,
     gradient_clip=0.0,
+    average_decay=0.9,
 )
 
 

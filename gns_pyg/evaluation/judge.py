@@ -1,0 +1,24 @@
+"""A simulator against the DEM runs it has never seen."""
+
+from collections.abc import Sequence
+
+from gns_pyg.data.trajectory import Trajectory
+from gns_pyg.dynamics.simulator import Simulator
+from gns_pyg.evaluation.baselines import FIRST_FRAME, Climatology
+from gns_pyg.evaluation.metrics import Evaluation, case_result, evaluate_cases
+from gns_pyg.evaluation.predict import one_step_errors, roll_out, start_frame
+
+
+def judge(simulator: Simulator, cases: Sequence[Trajectory], climatology: Climatology, start_s: float) -> Evaluation:
+    """Rolls every case out from `start_s`, predicts single steps along it, and compares both with DEM.
+
+    Raises:
+        NumericalError: if a roll-out diverges; names step, field and grain.
+    """
+    results = []
+    for case in cases:
+        start = start_frame(case, start_s)
+        pos, seconds = roll_out(simulator, case, start)
+        errors = one_step_errors(simulator, case)
+        results.append(case_result(case, simulator.scene, pos, start, errors, FIRST_FRAME, seconds))
+    return evaluate_cases(results, climatology, simulator.scene)
