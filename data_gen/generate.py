@@ -7,10 +7,8 @@ import sys
 import time
 from collections.abc import Mapping
 from pathlib import Path
-from typing import Any
 
 import hydra
-import numpy as np
 from hydra.core.hydra_config import HydraConfig
 from hydra.errors import CompactHydraException
 from hydra.types import RunMode
@@ -23,7 +21,7 @@ from data_gen.initial import initial_state
 from gns_pyg.config import CONF, flat, plain, require
 from gns_pyg.data.trajectory import Trajectory
 from gns_pyg.errors import DataError, GnsError
-from gns_pyg.scene.mesh import build_mesh
+from gns_pyg.scene.mesh import build_mesh, same_mesh
 from gns_pyg.scene.scene import Scene
 
 READ_LATER = ("cases", "angle_of_repose", "points")  # keys of a scene that do not influence its DEM run
@@ -71,7 +69,7 @@ def check_finished(path: Path, scene: Scene, meshes: Mapping[str, Trimesh]) -> s
     }
     serious = [text for key, text in differences.items() if not set(READ_LATER) & set(key.split("."))]
     for name, part in trajectory.boundary.items():
-        if name in meshes and not _same_mesh(part, meshes[name]):  # a mesh file can change behind an equal path
+        if name in meshes and not same_mesh(part, meshes[name]):  # a mesh file can change behind an equal path
             serious.append(f"boundary.{name}: another mesh than the file's")
     if serious:
         raise DataError(
@@ -81,11 +79,6 @@ def check_finished(path: Path, scene: Scene, meshes: Mapping[str, Trimesh]) -> s
             "delete the file to generate it anew, or choose another folder with out=...",
         )
     return f" (it keeps {'; '.join(differences.values())})" if differences else ""
-
-
-def _same_mesh(stored: Mapping[str, Any], mesh: Trimesh) -> bool:
-    pairs = ((stored["vertices"], mesh.vertices), (stored["triangles"], mesh.faces))
-    return all(old.shape == new.shape and np.allclose(old, new, atol=1e-9) for old, new in pairs)
 
 
 class Progress:

@@ -16,6 +16,7 @@ from gns_pyg.data.trajectory import Trajectory
 from gns_pyg.data.windows import UpdateSampler, Windows
 from gns_pyg.errors import DataError
 from gns_pyg.scene.containment import outside
+from gns_pyg.scene.mesh import build_mesh, require_closed, same_mesh
 from gns_pyg.scene.scene import Scene
 from gns_pyg.state import Window
 
@@ -40,6 +41,8 @@ class DataConfig:
 
     def __post_init__(self) -> None:
         require(0 <= self.test_fraction < 1, "data.test_fraction", self.test_fraction, "0 up to below 1", "e.g. 0.2")
+        require(self.val_cases >= 0, "data.val_cases", self.val_cases, "at least 0", "e.g. 1; 0 validates on no case")
+        require(self.workers >= 0, "data.workers", self.workers, "at least 0", "0 loads data in the main process")
 
 
 @dataclass(frozen=True)
@@ -121,13 +124,17 @@ def split(scene: Scene, config: DataConfig) -> Split:
 
 
 def check_same_scene(trajectory: Trajectory, scene: Scene) -> None:
-    """Raises DataError, naming every difference, if a case was not made from what `scene` describes."""
+    """Compares what a case says it was made from, and what it holds, with `scene`.
+
+    Raises:
+        DataError: if they differ; names every difference.
+    """
     ours, theirs = _physics(asdict(scene)), _physics(trajectory.scene)
     different = [
         f"{key} = {theirs.get(key)!r} (scene: {ours.get(key)!r})"
         for key in sorted(ours | theirs)
         if ours.get(key) != theirs.get(key)
-    ]
+    ] + _held_otherwise(trajectory, scene)
     if different:
         raise DataError(
             trajectory.path,
@@ -138,7 +145,15 @@ def check_same_scene(trajectory: Trajectory, scene: Scene) -> None:
 
 
 def check_inside(trajectory: Trajectory, scene: Scene) -> None:
-    """Raises DataError, naming the first, if grains of a case start outside the boundary."""
+    """Checks that every grain of a case starts inside the boundary.
+
+    Raises:
+        GeometryError: for a part made of a mesh file that is not closed: it has no inside.
+        DataError: if grains are outside; names the first.
+    """
+    for name, part in scene.boundary.items():
+        if part.shape.get("kind") == "file":
+            require_closed(build_mesh(name, part), f"scene.boundary.{name}")
     first = trajectory.read("position", 0, 1)
     out = np.flatnonzero(outside(first, trajectory.times_s[:1], scene)[0])
     if len(out):
@@ -148,6 +163,29 @@ def check_inside(trajectory: Trajectory, scene: Scene) -> None:
             "every grain inside",
             "correct the scene's boundary, or generate the case again",
         )
+
+
+def _held_otherwise(trajectory: Trajectory, scene: Scene) -> list[str]:
+    """What a case holds that `scene` does not describe, whatever the case says of itself."""
+    wrong: list[str] = []
+    dt_s, radius_m, count = scene.frame_dt_s, scene.grains.radius_m, scene.grains.count
+    times_s = trajectory.times_s - trajectory.times_s[0]
+    off_s = np.abs(times_s - dt_s * np.arange(trajectory.n_frames))
+    if (off_s > 1e-6 * dt_s).any():
+        frame = int((off_s > 1e-6 * dt_s).argmax())
+        wrong.append(f"frame {frame} is {times_s[frame]:g} s after the first (scene: {frame * dt_s:g} s)")
+    if (odd := np.abs(trajectory.radius / radius_m - 1) > 1e-9).any():
+        grain = int(odd.argmax())
+        wrong.append(f"grain {grain} has a radius of {trajectory.radius[grain]:.9g} m (scene: {radius_m} m)")
+    if trajectory.n_grains != count:
+        wrong.append(f"{trajectory.n_grains} grains stored (scene: {count})")
+    stored = trajectory.boundary
+    for name in sorted(stored.keys() | scene.boundary.keys()):
+        if name not in stored or name not in scene.boundary:
+            wrong.append(f"boundary.{name}: a mesh {'in the scene' if name in scene.boundary else 'stored'} only")
+        elif not same_mesh(stored[name], build_mesh(name, scene.boundary[name])):
+            wrong.append(f"boundary.{name}: another mesh stored than the scene's")
+    return wrong
 
 
 def _physics(scene: Mapping[str, Any]) -> dict[str, Any]:

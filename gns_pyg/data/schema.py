@@ -1,4 +1,6 @@
-"""The trajectory file's layout (H5MD 1.1): keys, units and what a valid file must hold. numpy, h5py and errors only."""
+"""The trajectory file's layout (H5MD 1.1): keys, units and what a valid file must hold. numpy and h5py only."""
+
+import json
 
 import h5py
 import numpy as np
@@ -8,59 +10,109 @@ GRAINS = "particles/grains"
 UNITS = {"position": "m", "velocity": "m s-1", "angular_velocity": "rad s-1"}
 FIXED_UNITS = {"radius": "m", "mass": "kg"}
 OPTIONAL = {"gns_pyg": {"angular_velocity"}}  # by creator: a model's state need not hold rotation; DEM's does
+NUMBERS = "fiu"  # numpy's kinds of real numbers
 RUN_KEYS = ("wall_clock_s", "cores", "steps", "dt_s", "creator", "creator_version")
 
 
 def violations(file: h5py.File) -> list[str]:
     """Lists everything in `file` that breaks the layout; an empty list is a valid file.
 
-    Positions are checked for finite values frame block by frame block, so memory stays bounded.
+    Fields are checked for finite values frame block by frame block, so memory stays bounded.
     """
     wrong: list[str] = []
-    if "h5md" not in file or "version" not in file["h5md"].attrs:
+    header, parameters = file.get("h5md"), file.get("parameters")
+    if not isinstance(header, h5py.Group) or "version" not in header.attrs:
         wrong.append("/h5md: attribute `version` missing; expected an H5MD 1.x file")
-    if GRAINS not in file:
-        return [*wrong, f"/{GRAINS}: group missing"]
-    grains = file[GRAINS]
-    if "box" not in grains:
-        wrong.append(f"/{GRAINS}/box: group missing")
-    n_frames = n_grains = None
-    creator = _text(file["parameters"].attrs.get("creator")) if "parameters" in file else None
-    for name, unit in UNITS.items():
-        if name not in grains and name in OPTIONAL.get(creator or "", ()):
-            continue
-        if f"{name}/value" not in grains or f"{name}/time" not in grains:
-            wrong.append(f"/{GRAINS}/{name}: `value` or `time` missing")
-            continue
-        value, time = grains[name]["value"], grains[name]["time"]
-        if value.ndim != 3 or value.shape[2] != 3 or value.dtype.kind != "f":
-            wrong.append(
-                f"/{GRAINS}/{name}/value: {value.dtype} {value.shape}, expected floats (n_frames, n_grains, 3)"
-            )
-            continue
-        n_frames, n_grains = (n_frames or value.shape[0]), (n_grains or value.shape[1])
-        if value.shape[:2] != (n_frames, n_grains):
-            wrong.append(f"/{GRAINS}/{name}/value: shape {value.shape}, expected ({n_frames}, {n_grains}, 3)")
-        if (found := _text(value.attrs.get("unit"))) != unit:
-            wrong.append(f"/{GRAINS}/{name}/value: unit {found!r}, expected {unit!r}")
-        if time.shape != (value.shape[0],):
-            wrong.append(f"/{GRAINS}/{name}/time: shape {time.shape}, expected ({value.shape[0]},)")
-        elif not np.all(np.diff(time[:]) > 0):
-            wrong.append(f"/{GRAINS}/{name}/time: not strictly increasing")
-        wrong += _not_finite(value, f"/{GRAINS}/{name}/value")
-    for name in FIXED_UNITS:
-        if name not in grains:
-            wrong.append(f"/{GRAINS}/{name}: missing")
-        elif n_grains is not None and grains[name].shape != (n_grains,):
-            wrong.append(f"/{GRAINS}/{name}: shape {grains[name].shape}, expected ({n_grains},)")
-        elif not np.all(grains[name][:] > 0):
-            wrong.append(f"/{GRAINS}/{name}: holds a value that is not above 0")
-    if "parameters" not in file or "scene" not in file["parameters"].attrs:
-        wrong.append("/parameters: attribute `scene` missing")
+    creator = None
+    if not isinstance(parameters, h5py.Group):
+        wrong.append("/parameters: group missing")
     else:
-        missing = [key for key in RUN_KEYS if key not in file["parameters"].attrs]
-        wrong += [f"/parameters: attribute `{key}` missing" for key in missing]
+        creator = _text(parameters.attrs.get("creator"))
+        wrong += _not_json(parameters, "scene")
+        wrong += [f"/parameters: attribute `{key}` missing" for key in RUN_KEYS if key not in parameters.attrs]
+    if isinstance(grains := file.get(GRAINS), h5py.Group):
+        wrong += _wrong_grains(grains, creator or "")
+    else:
+        wrong.append(f"/{GRAINS}: group missing")
+    boundary = file.get("boundary", {})
+    if not isinstance(boundary, h5py.Group) and "boundary" in file:
+        return [*wrong, "/boundary: a data set, expected a group"]
+    return wrong + [text for name in boundary for text in _wrong_part(file, f"boundary/{name}")]
+
+
+def _wrong_grains(grains: h5py.Group, creator: str) -> list[str]:
+    wrong: list[str] = []
+    if not isinstance(grains.get("box"), h5py.Group):
+        wrong.append(f"/{GRAINS}/box: group missing")
+    size: tuple[int, int] | None = None  # frames and grains of the first field; the others must be like it
+    for name, unit in UNITS.items():
+        if name not in grains and name in OPTIONAL.get(creator, ()):
+            continue
+        value, time = _dataset(grains, f"{name}/value", unit, wrong), _dataset(grains, f"{name}/time", "s", wrong)
+        if value is None or time is None:
+            continue
+        where = f"/{GRAINS}/{name}"
+        if value.ndim != 3 or value.shape[2] != 3 or value.dtype.kind != "f":
+            wrong.append(f"{where}/value: {value.dtype} {value.shape}, expected floats (n_frames, n_grains, 3)")
+            continue
+        size = size or value.shape[:2]
+        if value.shape[:2] != size:
+            wrong.append(f"{where}/value: shape {value.shape}, expected ({size[0]}, {size[1]}, 3)")
+        if 0 in value.shape:
+            wrong.append(
+                f"{where}/value: {value.shape[0]} frames of {value.shape[1]} grains, expected at least 1 of each"
+            )
+        if time.shape != value.shape[:1] or time.dtype.kind not in NUMBERS:
+            wrong.append(f"{where}/time: {time.dtype} {time.shape}, expected numbers ({value.shape[0]},)")
+        elif not (np.isfinite(time[:]).all() and (np.diff(time[:]) > 0).all()):
+            wrong.append(f"{where}/time: not finite and strictly increasing")
+        wrong += _not_finite(value, f"{where}/value")
+    for name, unit in FIXED_UNITS.items():
+        if (fixed := _dataset(grains, name, unit, wrong)) is None:
+            continue
+        n_grains = fixed.shape[:1] if size is None else size[1:]
+        if fixed.ndim != 1 or fixed.shape != n_grains or fixed.dtype.kind not in NUMBERS:
+            wrong.append(f"/{GRAINS}/{name}: {fixed.dtype} {fixed.shape}, expected numbers {n_grains}")
+        elif not (np.isfinite(fixed[:]).all() and (fixed[:] > 0).all()):
+            wrong.append(f"/{GRAINS}/{name}: holds a value that is not finite and above 0")
     return wrong
+
+
+def _wrong_part(file: h5py.File, path: str) -> list[str]:
+    part = file.get(path)
+    if not isinstance(part, h5py.Group):
+        return [f"/{path}: expected a group"]
+    wrong = _not_json(part, "motion")
+    vertices, triangles = _dataset(part, "vertices", "m", wrong), _dataset(part, "triangles", None, wrong)
+    for data, kinds, expected in ((vertices, "f", "floats (n, 3)"), (triangles, "iu", "whole numbers (m, 3)")):
+        if data is not None and (data.ndim != 2 or data.shape[1] != 3 or data.dtype.kind not in kinds):
+            wrong.append(f"{data.name}: {data.dtype} {data.shape}, expected {expected}")
+    if wrong or vertices is None or triangles is None:
+        return wrong
+    if not ((triangles[:] >= 0) & (triangles[:] < len(vertices))).all():
+        wrong.append(f"{triangles.name}: not all are rows of vertices (0 to {len(vertices) - 1})")
+    return wrong
+
+
+def _dataset(group: h5py.Group, path: str, unit: str | None, wrong: list[str]) -> h5py.Dataset | None:
+    """The data set at `path`; what is wrong with its presence or unit is added to `wrong`."""
+    found, where = group.get(path), f"{group.name}/{path}"
+    if not isinstance(found, h5py.Dataset):
+        wrong.append(f"{where}: missing" if found is None else f"{where}: not a data set")
+        return None
+    if unit is not None and (given := _text(found.attrs.get("unit"))) != unit:
+        wrong.append(f"{where}: unit {given!r}, expected {unit!r}")
+    return found
+
+
+def _not_json(group: h5py.Group, name: str) -> list[str]:
+    if name not in group.attrs:
+        return [f"{group.name}: attribute `{name}` missing"]
+    try:
+        value = json.loads(group.attrs[name])
+    except (TypeError, ValueError) as error:
+        return [f"{group.name}: attribute `{name}` is not JSON ({error})"]
+    return [] if isinstance(value, dict) else [f"{group.name}: attribute `{name}` is no JSON object"]
 
 
 def _not_finite(value: h5py.Dataset, where: str) -> list[str]:
@@ -74,4 +126,7 @@ def _not_finite(value: h5py.Dataset, where: str) -> list[str]:
 
 
 def _text(value: object) -> str | None:
-    return value.decode() if isinstance(value, bytes) else value  # type: ignore[return-value]
+    """An attribute as text; None where there is none."""
+    if isinstance(value, bytes):
+        return value.decode(errors="replace")
+    return value if value is None or isinstance(value, str) else repr(value)

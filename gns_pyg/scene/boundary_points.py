@@ -8,8 +8,10 @@ from scipy.spatial import cKDTree
 from trimesh import Trimesh
 
 from gns_pyg.config import require
+from gns_pyg.errors import GeometryError
 
 CANDIDATES_PER_POINT = 5
+TESTS_PER_POINT = 20  # places of the surface that `check_density` looks at
 ALPHA, BETA, GAMMA = 8, 0.65, 1.5  # Yuksel's choices: the weight's exponent and its limit at small distances
 
 LARGEST_HOLE = 1.12  # farthest place from any point, in spacings of the densest packing; measured on all scenes
@@ -59,10 +61,46 @@ def sufficient_points(mesh: Trimesh, radius_m: float, cutoff_radius_m: float) ->
     Raises:
         ConfigError: if a touching grain's centre is out of reach of the point that it touches.
     """
-    where = "cutoff_radius_m"
-    require(cutoff_radius_m > radius_m, where, cutoff_radius_m, f"above the grain radius {radius_m}", "raise it")
-    spacing = np.sqrt(cutoff_radius_m**2 - radius_m**2) / LARGEST_HOLE
+    spacing = _reach(cutoff_radius_m, radius_m) / LARGEST_HOLE
     return int(np.ceil(2 * mesh.area / (np.sqrt(3) * spacing**2)))
+
+
+def check_density(name: str, points: BoundaryPoints, mesh: Trimesh, cutoff_m: float, radius_m: float) -> None:
+    """Checks that a grain that touches a part anywhere sees at least one of its points.
+
+    The centre of a touching grain is a radius off the wall, so every place of the wall needs a point within
+    sqrt(cutoff_m^2 - radius_m^2). Random places are looked at, always the same ones.
+
+    Args:
+        name: the part's key under scene.boundary; errors name it.
+        points: the part's points.
+        mesh: the part as `build_mesh` makes it, m.
+        cutoff_m: how far a grain's centre sees boundary points.
+        radius_m: grain radius.
+
+    Raises:
+        ConfigError: if a touching grain's centre is out of reach of the point that it touches.
+        GeometryError: if the points are too few; says how many would do.
+    """
+    reach, n = _reach(cutoff_m, radius_m), len(points.pos)
+    places = _uniform(mesh, max(TESTS_PER_POINT * n, 10_000), np.random.default_rng(0))[0]
+    hole = cKDTree(points.pos).query(places)[0].max()
+    if hole >= reach:
+        enough = max(sufficient_points(mesh, radius_m, cutoff_m), int(np.ceil(n * (hole / reach) ** 2)))
+        raise GeometryError(
+            f"scene.boundary.{name}.points",
+            f"{n} points: a place of the wall is {hole:.3g} m away from the nearest one",
+            f"a point within {reach:.3g} m of every place, so that a grain that touches the wall sees it "
+            f"(cutoff {cutoff_m:.3g} m, grain radius {radius_m:.3g} m); {enough} points would do",
+            f"set scene.boundary.{name}.points={enough}, or raise model.cutoff_wall_radii",
+        )
+
+
+def _reach(cutoff_m: float, radius_m: float) -> float:
+    """How far along a flat wall the centre of a grain that touches it sees, m."""
+    expected = f"above the grain radius, {radius_m} m"
+    require(cutoff_m > radius_m, "model.cutoff_wall_radii", f"a cutoff of {cutoff_m} m", expected, "set it above 1")
+    return float(np.sqrt(cutoff_m**2 - radius_m**2))
 
 
 def _uniform(mesh: Trimesh, n: int, generator: np.random.Generator) -> tuple[np.ndarray, np.ndarray]:

@@ -1,5 +1,7 @@
 """Triangle meshes of boundary parts: the one source for Yade's facets and for the network's boundary points."""
 
+import math
+from collections.abc import Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
@@ -11,7 +13,7 @@ from trimesh import Trimesh
 
 from gns_pyg.config import require, typed
 from gns_pyg.errors import GeometryError
-from gns_pyg.scene.scene import Part
+from gns_pyg.scene.scene import Part, finite, positive
 
 BLOCK = 20_000  # point-triangle pairs handled at once: few enough to stay in the processor's cache
 
@@ -20,15 +22,19 @@ BLOCK = 20_000  # point-triangle pairs handled at once: few enough to stay in th
 class Revolution:
     """`profile_m` ([[radius, z], ...] from the bottom up) turned about z and closed to the axis at both ends."""
 
-    profile_m: list[list[float]] = MISSING
+    profile_m: list[Any] = MISSING  # pairs of numbers: OmegaConf would refuse whole ones in nested lists of floats
     segments: int = 48
 
     def mesh(self, where: str) -> Trimesh:
-        remedy = f"correct {where}.profile_m"
-        pairs = len(self.profile_m) >= 2 and all(len(point) == 2 for point in self.profile_m)
-        require(pairs, f"{where}.profile_m", self.profile_m, "two or more [radius, z] pairs", remedy)
-        profile = np.array(self.profile_m)
-        require(bool((profile[:, 0] >= 0).all()), f"{where}.profile_m", self.profile_m, "radii of at least 0", remedy)
+        key, remedy = f"{where}.profile_m", f"correct {where}.profile_m, e.g. [[0.1, 0], [0.1, 0.3]]"
+        pairs = len(self.profile_m) >= 2 and all(
+            isinstance(point, list) and finite(point, 2) for point in self.profile_m
+        )
+        require(pairs, key, self.profile_m, "two or more [radius, z] pairs of finite numbers", remedy)
+        profile = np.array(self.profile_m, np.float64)
+        radii_ok = bool((profile[:, 0] >= 0).all() and (profile[:, 0] > 0).any())
+        require(radii_ok, key, self.profile_m, "radii of at least 0, not all of them 0", remedy)
+        require(bool(np.ptp(profile[:, 1]) > 0), key, self.profile_m, "points at different heights z", remedy)
         require(self.segments >= 3, f"{where}.segments", self.segments, "at least 3", "e.g. 48")
         return _revolve(profile, self.segments)
 
@@ -43,9 +49,10 @@ class Cylinder:
     segments: int = 48
 
     def mesh(self, where: str) -> Trimesh:
-        require(self.radius_m > 0, f"{where}.radius_m", self.radius_m, "above 0 m", "set it above 0")
-        require(self.length_m > 0, f"{where}.length_m", self.length_m, "above 0 m", "set it above 0")
-        require(len(self.axis) == 3 and any(self.axis), f"{where}.axis", self.axis, "a direction", "e.g. [1, 0, 0]")
+        positive(f"{where}.radius_m", self.radius_m, "m")
+        positive(f"{where}.length_m", self.length_m, "m")
+        axis_ok = finite(self.axis, 3) and any(self.axis)
+        require(axis_ok, f"{where}.axis", self.axis, "three finite numbers that are not all 0", "e.g. [1, 0, 0]")
         require(self.segments >= 3, f"{where}.segments", self.segments, "at least 3", "e.g. 48")
         half = self.length_m / 2
         mesh = _revolve(np.array([[self.radius_m, -half], [self.radius_m, half]]), self.segments)
@@ -60,9 +67,10 @@ class Box:
     center_m: list[float] = field(default_factory=lambda: [0.0, 0.0, 0.0])
 
     def mesh(self, where: str) -> Trimesh:
-        size_ok = len(self.size_m) == 3 and min(self.size_m) > 0
-        require(size_ok, f"{where}.size_m", self.size_m, "three lengths above 0 m", "e.g. [0.3, 0.2, 0.1]")
-        require(len(self.center_m) == 3, f"{where}.center_m", self.center_m, "three numbers", "e.g. [0, 0, 0.05]")
+        size_ok = finite(self.size_m, 3) and min(self.size_m) > 0
+        require(size_ok, f"{where}.size_m", self.size_m, "three finite lengths above 0 m", "e.g. [0.3, 0.2, 0.1]")
+        center_ok = finite(self.center_m, 3)
+        require(center_ok, f"{where}.center_m", self.center_m, "three finite numbers", "e.g. [0, 0, 0.05]")
         return trimesh.creation.box(self.size_m).apply_translation(self.center_m)
 
 
@@ -76,7 +84,8 @@ class File:
     def mesh(self, where: str) -> Trimesh:
         path = Path(self.path).expanduser()
         require(path.is_file(), f"{where}.path", f"no file at {path.resolve()}", "a mesh file", "correct the path")
-        require(self.scale > 0, f"{where}.scale", self.scale, "above 0", "1 for metres, 0.001 for millimetres")
+        scale_ok = math.isfinite(self.scale) and self.scale > 0
+        require(scale_ok, f"{where}.scale", self.scale, "finite, above 0", "1 for metres, 0.001 for millimetres")
         try:
             mesh = trimesh.load_mesh(path)
         except Exception as error:  # each file format has errors of its own
@@ -85,7 +94,7 @@ class File:
             raise GeometryError(path, "no triangles", "a triangle mesh", "export it again, e.g. as binary STL")
         mesh.merge_vertices(merge_tex=True, merge_norm=True)  # STL repeats corners; only joined ones can be closed
         mesh.update_faces(mesh.nondegenerate_faces())
-        if mesh.is_watertight and not mesh.is_winding_consistent:
+        if not mesh.is_winding_consistent:
             raise GeometryError(
                 path,
                 "neighbouring triangles are wound in opposite ways",
@@ -133,8 +142,20 @@ def require_closed(mesh: Trimesh, where: str) -> None:
         f"{(n_triangles_at_edge == 1).sum()} open edges and {(n_triangles_at_edge > 2).sum()} edges with more than two "
         f"triangles, of {len(n_triangles_at_edge)}",
         "a closed surface, so that inside and outside are defined",
-        "close the holes (e.g. mesh.fill_holes() of trimesh, or in the CAD program) and export it again",
+        "close the holes (e.g. mesh.fill_holes() of trimesh, or in the CAD program) and export it again; "
+        "open parts made of files are not supported as containers yet",
     )
+
+
+def same_mesh(stored: Mapping[str, Any], mesh: Trimesh) -> bool:
+    """Whether a stored part is `mesh`: the same triangles, corner by corner, to 1 nm; the corners' numbering is free.
+
+    Args:
+        stored: a part as `Trajectory.boundary` gives it: `vertices` (n, 3), m, and `triangles` (m, 3), rows of them.
+        mesh: part as `build_mesh` makes it, m.
+    """
+    corners = np.asarray(stored["vertices"])[np.asarray(stored["triangles"])]
+    return corners.shape == mesh.triangles.shape and np.allclose(corners, mesh.triangles, rtol=0, atol=1e-9)
 
 
 def inside(mesh: Trimesh, pos: np.ndarray) -> np.ndarray:

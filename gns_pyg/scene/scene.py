@@ -4,7 +4,9 @@ These records are also OmegaConf schemas, hence plain containers and no unions b
 """
 
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass, field
+from numbers import Real
 from typing import Any, Union
 
 from omegaconf import MISSING
@@ -12,8 +14,25 @@ from omegaconf import MISSING
 from gns_pyg.config import require, typed
 
 
-def _positive(where: str, value: float, unit: str) -> None:
-    require(math.isfinite(value) and value > 0, where, value, f"a finite number above 0 {unit}", f"set {where} above 0")
+def positive(where: str, value: float, unit: str = "") -> None:
+    """Raises ConfigError naming the key `where` unless `value` is finite and above 0."""
+    expected = f"a finite number above 0 {unit}".rstrip()
+    require(math.isfinite(value) and value > 0, where, value, expected, f"set {where} above 0")
+
+
+def finite(values: Sequence[Any], n: int) -> bool:
+    """Whether `values` are `n` finite numbers."""
+    return len(values) == n and all(isinstance(value, Real) and math.isfinite(value) for value in values)
+
+
+def _not_negative(where: str, value: float, unit: str = "") -> None:
+    expected = f"a finite number of at least 0 {unit}".rstrip()
+    require(math.isfinite(value) and value >= 0, where, value, expected, f"set {where} to 0 or above")
+
+
+def _friction_angle(where: str, angle_rad: float) -> None:
+    known = "at least 0 and below pi/2 rad"
+    require(0 <= angle_rad < math.pi / 2, where, angle_rad, known, "give the angle in rad, e.g. 0.5 (29 degrees)")
 
 
 @dataclass
@@ -26,8 +45,10 @@ class Material:
     friction_angle_rad: float = MISSING
 
     def __post_init__(self) -> None:
-        _positive("scene.grains.material.density_kg_m3", self.density_kg_m3, "kg/m^3")
-        _positive("scene.grains.material.young_modulus_pa", self.young_modulus_pa, "Pa")
+        positive("scene.grains.material.density_kg_m3", self.density_kg_m3, "kg/m^3")
+        positive("scene.grains.material.young_modulus_pa", self.young_modulus_pa, "Pa")
+        positive("scene.grains.material.poisson_ratio", self.poisson_ratio)
+        _friction_angle("scene.grains.material.friction_angle_rad", self.friction_angle_rad)
 
 
 @dataclass
@@ -40,7 +61,7 @@ class Grains:
 
     def __post_init__(self) -> None:
         require(self.count > 0, "scene.grains.count", self.count, "at least 1", "set it to the number of grains")
-        _positive("scene.grains.radius_m", self.radius_m, "m")
+        positive("scene.grains.radius_m", self.radius_m, "m")
 
 
 @dataclass
@@ -64,6 +85,7 @@ class Initial:
         require(
             self.arrangement in known, "scene.initial.arrangement", self.arrangement, " or ".join(known), "pick one"
         )
+        _not_negative("scene.initial.speed_max_m_s", self.speed_max_m_s, "m/s")
 
 
 @dataclass
@@ -75,19 +97,22 @@ class Motion:
     origin_m: list[float] = field(default_factory=lambda: [0.0, 0.0, 0.0])
     rate_rad_s: float = 0.0
 
-    def __post_init__(self) -> None:
+    def check(self, where: str) -> None:
+        """Raises ConfigError for a value out of range; `where` is this record's key, which only the scene knows."""
         known = ("none", "rotation")
-        require(
-            self.kind in known, "scene.boundary.<part>.motion.kind", self.kind, " or ".join(known), "pick one of them"
-        )
+        require(self.kind in known, f"{where}.kind", self.kind, " or ".join(known), "pick one of them")
         if self.kind == "rotation":
             require(
-                len(self.axis) == 3 and math.hypot(*self.axis) > 0,
-                "scene.boundary.<part>.motion.axis",
+                finite(self.axis, 3) and any(self.axis),
+                f"{where}.axis",
                 self.axis,
-                "three numbers that are not all 0",
+                "three finite numbers that are not all 0",
                 "give the direction of the rotation axis, e.g. [1, 0, 0]",
             )
+            origin_ok = finite(self.origin_m, 3)
+            require(origin_ok, f"{where}.origin_m", self.origin_m, "three finite numbers", "e.g. [0, 0, 0]")
+            rate_ok = math.isfinite(self.rate_rad_s)
+            require(rate_ok, f"{where}.rate_rad_s", self.rate_rad_s, "a finite number", "e.g. 3.0")
 
     @property
     def moves(self) -> bool:
@@ -110,6 +135,13 @@ class Part:
     friction_angle_rad: float = MISSING
     motion: Motion = field(default_factory=Motion)
 
+    def check(self, where: str) -> None:
+        """Raises ConfigError for a value out of range; `where` is this record's key, which only the scene knows."""
+        enough = "see docs/assumptions.md for a sufficient number"
+        require(self.points >= 1, f"{where}.points", self.points, "at least 1", enough)
+        _friction_angle(f"{where}.friction_angle_rad", self.friction_angle_rad)
+        self.motion.check(f"{where}.motion")
+
 
 @dataclass
 class AngleOfRepose:
@@ -119,6 +151,15 @@ class AngleOfRepose:
     kind: str = MISSING
     axis: list[float] = field(default_factory=lambda: [1.0, 0.0, 0.0])
     from_s: float = MISSING
+
+    def check(self, where: str) -> None:
+        """Raises ConfigError for a value out of range; `where` is this record's key."""
+        known = ("plane", "radial")
+        require(self.kind in known, f"{where}.kind", self.kind, " or ".join(known), "pick one of them")
+        axis_ok = self.kind == "radial" or (finite(self.axis, 3) and any(self.axis))
+        found, expected = self.axis, "three finite numbers that are not all 0"
+        require(axis_ok, f"{where}.axis", found, expected, "give the direction of the drum's axis, e.g. [1, 0, 0]")
+        _not_negative(f"{where}.from_s", self.from_s, "s")
 
 
 @dataclass
@@ -130,9 +171,10 @@ class Dem:
     decimals: dict[str, int] = field(default_factory=lambda: {"position": 7, "velocity": 5, "angular_velocity": 3})
 
     def __post_init__(self) -> None:
+        _not_negative("scene.dem.verlet_distance_ratio", self.verlet_distance_ratio)
         if self.dt_s != "auto":
             require(not isinstance(self.dt_s, str), "scene.dem.dt_s", self.dt_s, "seconds or auto", "e.g. 1e-5")
-            _positive("scene.dem.dt_s", float(self.dt_s), "s")
+            positive("scene.dem.dt_s", float(self.dt_s), "s")
 
 
 @dataclass
@@ -154,14 +196,24 @@ class Scene:
     angle_of_repose: AngleOfRepose | None = None
 
     def __post_init__(self) -> None:
-        _positive("scene.duration_s", self.duration_s, "s")
-        _positive("scene.frame_dt_s", self.frame_dt_s, "s")
+        positive("scene.duration_s", self.duration_s, "s")
+        positive("scene.frame_dt_s", self.frame_dt_s, "s")
+        a_frame = self.duration_s >= self.frame_dt_s * (1 - 1e-9)
+        expected = f"at least one frame, scene.frame_dt_s = {self.frame_dt_s} s"
+        require(a_frame, "scene.duration_s", self.duration_s, expected, "raise it, or lower scene.frame_dt_s")
+        require(self.cases >= 1, "scene.cases", self.cases, "at least 1", "set it to the number of cases")
+        require(self.seed >= 0, "scene.seed", self.seed, "at least 0", "any whole number from 0 on")
         require(
             0 <= self.damping < 1, "scene.damping", self.damping, "at least 0 and below 1", "0 is no damping at all"
         )
-        require(
-            len(self.gravity_m_s2) == 3, "scene.gravity_m_s2", self.gravity_m_s2, "three numbers", "e.g. [0, 0, -9.81]"
-        )
+        gravity, example = self.gravity_m_s2, "e.g. [0, 0, -9.81]"
+        require(finite(gravity, 3), "scene.gravity_m_s2", gravity, "three finite numbers", example)
+        for name, part in self.boundary.items():
+            a_word = "a Python identifier: letters, digits and _, no digit first"
+            require(name.isidentifier(), f"scene.boundary.{name}", name, a_word, "rename the part")
+            part.check(f"scene.boundary.{name}")
+        if self.angle_of_repose is not None:
+            self.angle_of_repose.check("scene.angle_of_repose")
 
     @staticmethod
     def from_config(values: Any) -> "Scene":

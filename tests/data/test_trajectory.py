@@ -66,10 +66,10 @@ def test_a_part_of_the_frames_is_that_part_of_the_whole(good) -> None:
     assert (trajectory.read("velocity", 7, 12) == trajectory.read("velocity")[7:12]).all()
 
 
-def test_opening_reads_no_frames_and_an_open_trajectory_travels_to_workers(good) -> None:
+def test_an_open_trajectory_travels_to_workers_which_open_the_file_anew(good) -> None:
     trajectory = Trajectory(good)
-    assert trajectory._file is None
     whole = trajectory.read("position")
+    assert pickle.loads(pickle.dumps(trajectory))._file is None
     assert (pickle.loads(pickle.dumps(trajectory)).read("position") == whole).all()
 
 
@@ -136,6 +136,76 @@ def replace(path: Path, name: str, value: np.ndarray) -> None:
 def test_a_field_of_wrong_shape_type_or_content_is_refused(good, value, told) -> None:
     replace(good, "angular_velocity", value)
     with pytest.raises(DataError, match=told):
+        Trajectory(good)
+
+
+def test_units_are_compared(good) -> None:
+    places = [f"{GRAINS}/radius", f"{GRAINS}/mass", f"{GRAINS}/position/time", "boundary/floor/vertices"]
+    with h5py.File(good, "a") as file:
+        for place in places:
+            file[place].attrs["unit"] = "mm"
+        file[f"{GRAINS}/position/value"].attrs["unit"] = [1, 2]
+    with pytest.raises(DataError) as caught:
+        Trajectory(good)
+    for place in places:
+        assert f"/{place}: unit 'mm', expected" in str(caught.value)
+    assert "position/value: unit 'array([1, 2])', expected 'm'" in str(caught.value)
+
+
+@pytest.mark.parametrize("shape", [(0, 5, 3), (20, 0, 3)])
+def test_a_file_without_frames_or_grains_is_refused(good, shape) -> None:
+    for name in UNITS:
+        replace(good, name, np.zeros(shape))
+    with pytest.raises(DataError, match=f"{shape[0]} frames of {shape[1]} grains, expected at least 1"):
+        Trajectory(good)
+
+
+@pytest.mark.parametrize("content", ["{not json", 3.0, "[1, 2]"])
+@pytest.mark.parametrize(("place", "name"), [("parameters", "scene"), ("boundary/floor", "motion")])
+def test_an_attribute_that_is_no_json_object_is_a_violation(good, place, name, content) -> None:
+    with h5py.File(good, "a") as file:
+        file[place].attrs[name] = content
+        del file["parameters"].attrs["cores"]
+    with pytest.raises(DataError, match=rf"attribute `{name}` is no[\s\S]*JSON") as caught:
+        Trajectory(good)
+    assert "attribute `cores` missing" in str(caught.value)
+
+
+NEEDED = [
+    *("h5md", GRAINS, f"{GRAINS}/box", f"{GRAINS}/radius", f"{GRAINS}/mass", "parameters", "boundary/floor"),
+    *("boundary/floor/vertices", "boundary/floor/triangles"),
+    *(f"{GRAINS}/{name}{part}" for name in UNITS for part in ("", "/value", "/time")),
+]
+
+
+@pytest.mark.parametrize("replacement", ["nothing", "a group", "text", "one number"])
+@pytest.mark.parametrize("place", NEEDED)
+def test_something_else_in_a_place_is_a_violation_named_by_it(good, place, replacement) -> None:
+    if (place, replacement) in ((f"{GRAINS}/box", "a group"), ("boundary/floor", "nothing")):
+        return  # an empty box will do, and a scene may have no boundary
+    with h5py.File(good, "a") as file:
+        del file[place]
+        if replacement == "a group":
+            file.create_group(place)
+        elif replacement != "nothing":
+            file[place] = "text" if replacement == "text" else 1.0
+    with pytest.raises(DataError, match="delete the file and generate it again") as caught:
+        Trajectory(good)
+    assert f"/{place}" in str(caught.value)
+
+
+def test_a_boundary_that_is_no_group_is_a_violation(good) -> None:
+    with h5py.File(good, "a") as file:
+        del file["boundary"]
+        file["boundary"] = 1.0
+    with pytest.raises(DataError, match="/boundary: a data set, expected a group"):
+        Trajectory(good)
+
+
+def test_triangles_that_are_no_rows_of_vertices_are_a_violation(good) -> None:
+    with h5py.File(good, "a") as file:
+        file["boundary/floor/triangles"][0, 2] = 3
+    with pytest.raises(DataError, match=r"/boundary/floor/triangles: not all are rows of vertices \(0 to 2\)"):
         Trajectory(good)
 
 

@@ -10,8 +10,14 @@ from hydra import compose, initialize_config_dir
 from scipy.spatial import cKDTree
 
 import gns_pyg
-from gns_pyg.errors import ConfigError
-from gns_pyg.scene.boundary_points import LARGEST_HOLE, sample_boundary_points, sufficient_points
+from gns_pyg.errors import ConfigError, GeometryError
+from gns_pyg.scene.boundary_points import (
+    LARGEST_HOLE,
+    BoundaryPoints,
+    check_density,
+    sample_boundary_points,
+    sufficient_points,
+)
 from gns_pyg.scene.mesh import build_mesh, distance, inside
 from gns_pyg.scene.scene import Scene
 
@@ -90,3 +96,32 @@ def test_the_sufficient_number_closes_every_hole() -> None:
     surface, triangle = trimesh.sample.sample_surface(mesh, 50_000, seed=1)
     centre = surface - radius * mesh.face_normals[triangle]
     assert cKDTree(points.pos).query(centre[distance(mesh, centre) > 0.999 * radius])[0].max() < CUTOFF_RADII * radius
+
+
+@pytest.mark.parametrize("name", SCENES)
+def test_our_scenes_have_points_enough_and_a_third_of_them_is_too_few(name) -> None:
+    scene, mesh, points, _ = sampled(name)
+    radius = scene.grains.radius_m
+    check_density("walls", points, mesh, CUTOFF_RADII * radius, radius)
+    few = sample_boundary_points(mesh, len(points.pos) // 3, seed=scene.seed)
+    with pytest.raises(GeometryError, match=r"scene\.boundary\.walls\.points\n") as caught:
+        check_density("walls", few, mesh, CUTOFF_RADII * radius, radius)
+    assert f"{len(few.pos)} points" in caught.value.found
+    enough = int(caught.value.remedy.split("points=")[1].split(",")[0])
+    assert enough > len(few.pos)
+    check_density("walls", sample_boundary_points(mesh, enough), mesh, CUTOFF_RADII * radius, radius)
+
+
+def test_one_hole_among_many_points_is_found() -> None:
+    mesh = trimesh.creation.box([0.3, 0.3, 0.3])
+    points = sample_boundary_points(mesh, 3 * sufficient_points(mesh, 0.01, 0.025))
+    far = np.linalg.norm(points.pos - [0.15, 0.0, 0.0], axis=1) > 0.03
+    check_density("box", points, mesh, 0.025, 0.01)
+    with pytest.raises(GeometryError, match=r"scene\.boundary\.box\.points"):
+        check_density("box", BoundaryPoints(points.pos[far], points.normal[far]), mesh, 0.025, 0.01)
+
+
+def test_a_cutoff_within_a_grain_sees_no_wall() -> None:
+    mesh = trimesh.creation.box([0.3, 0.3, 0.3])
+    with pytest.raises(ConfigError, match=r"model\.cutoff_wall_radii"):
+        check_density("box", sample_boundary_points(mesh, 10), mesh, 0.01, 0.01)

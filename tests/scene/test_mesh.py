@@ -7,7 +7,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from gns_pyg.errors import ConfigError, GeometryError
-from gns_pyg.scene.mesh import build_mesh, distance, inside
+from gns_pyg.scene.mesh import build_mesh, distance, inside, same_mesh
 from gns_pyg.scene.scene import Part
 
 PROFILE = [[0.25, 0.0], [0.25, 0.3], [0.1, 0.45], [0.25, 0.6], [0.25, 0.9]]
@@ -43,6 +43,32 @@ def test_primitives_are_closed_and_have_the_volume_and_area_of_their_body(shape,
     assert mesh.is_winding_consistent
     assert mesh.volume == pytest.approx(volume, rel=1e-3)
     assert mesh.area == pytest.approx(area, rel=1e-3)
+
+
+@pytest.mark.parametrize(
+    "shape",
+    [
+        {"kind": "box", "size_m": [1, 2, 3], "center_m": [5, 0, 0]},
+        {"kind": "cylinder", "radius_m": 1, "length_m": 2, "axis": [1, 0, 0]},
+        {"kind": "revolution", "profile_m": [[0.1, 0], [1, 2]]},
+    ],
+)
+def test_whole_numbers_are_numbers(shape) -> None:
+    def decimal(value):
+        return [decimal(item) for item in value] if isinstance(value, list) else float(value)
+
+    exact = {"kind": shape["kind"]} | {key: decimal(value) for key, value in shape.items() if key != "kind"}
+    mesh, other = build_mesh("body", part(**shape)), build_mesh("body", part(**exact))
+    assert (mesh.triangles == other.triangles).all()
+
+
+def test_the_same_mesh_is_the_same_triangles_however_their_corners_are_numbered() -> None:
+    mesh = hopper(12)
+    order = np.random.default_rng(0).permutation(len(mesh.vertices))
+    renumbered = {"vertices": mesh.vertices[order], "triangles": np.argsort(order)[mesh.faces]}
+    assert same_mesh(renumbered, mesh)
+    assert not same_mesh(renumbered | {"vertices": mesh.vertices[order] + 1e-8}, mesh)
+    assert not same_mesh(renumbered | {"triangles": renumbered["triangles"][1:]}, mesh)
 
 
 def test_a_cylinder_lies_along_its_axis_around_the_origin() -> None:
@@ -118,6 +144,16 @@ def test_a_file_wound_inside_out_is_turned(tmp_path) -> None:
     assert inside(mesh, np.zeros((1, 3))).all()
 
 
+@pytest.mark.parametrize("closed", [True, False])
+def test_a_file_of_mixed_winding_is_refused(tmp_path, closed) -> None:
+    box = trimesh.creation.box([1.0, 1.0, 1.0])
+    faces = np.array(box.faces)
+    faces[5] = faces[5, ::-1]
+    trimesh.Trimesh(box.vertices, faces if closed else faces[:8], process=False).export(tmp_path / "box.stl")
+    with pytest.raises(GeometryError, match=r"box\.stl\n[\s\S]*opposite ways"):
+        build_mesh("box", part(kind="file", path=str(tmp_path / "box.stl")))
+
+
 def test_an_open_surface_has_no_inside_and_the_error_counts_its_open_edges(tmp_path) -> None:
     box = trimesh.creation.box([1.0, 1.0, 1.0])
     box.update_faces(np.arange(len(box.faces)) > 0)
@@ -135,12 +171,26 @@ def test_an_open_surface_has_no_inside_and_the_error_counts_its_open_edges(tmp_p
         ({"kind": "cylinder", "radius_m": 1.0}, "shape.length_m"),
         ({"kind": "cylinder", "radius_m": 1.0, "length_m": 1.0, "radios_m": 2.0}, "shape.radios_m"),
         ({"kind": "cylinder", "radius_m": -1.0, "length_m": 1.0}, "shape.radius_m"),
+        ({"kind": "cylinder", "radius_m": np.inf, "length_m": 1.0}, "shape.radius_m"),
+        ({"kind": "cylinder", "radius_m": 1.0, "length_m": np.nan}, "shape.length_m"),
+        ({"kind": "cylinder", "radius_m": 1.0, "length_m": 0}, "shape.length_m"),
+        ({"kind": "cylinder", "radius_m": 1.0, "length_m": 1.0, "axis": [1, 0, np.nan]}, "shape.axis"),
         ({"kind": "cylinder", "radius_m": 1.0, "length_m": "long"}, "shape.length_m"),
         ({"kind": "cylinder", "radius_m": 1.0, "length_m": 1.0, "axis": [0, 0, 0]}, "shape.axis"),
         ({"kind": "revolution", "profile_m": [[1.0, 0.0]]}, "shape.profile_m"),
         ({"kind": "revolution", "profile_m": [[1.0, 0.0], [-1.0, 1.0]]}, "shape.profile_m"),
+        ({"kind": "revolution", "profile_m": [[1.0, 0.0], [np.inf, 1.0]]}, "shape.profile_m"),
+        ({"kind": "revolution", "profile_m": [[1.0, 0.0], ["a", 1.0]]}, "shape.profile_m"),
+        ({"kind": "revolution", "profile_m": [[1.0, 0.0], 1.0]}, "shape.profile_m"),
+        ({"kind": "revolution", "profile_m": [[1.0, 0.0], "12"]}, "shape.profile_m"),
+        ({"kind": "revolution", "profile_m": [[0, 0], [0, 1]]}, "shape.profile_m"),
+        ({"kind": "revolution", "profile_m": [[1, 0], [2, 0]]}, "shape.profile_m"),
         ({"kind": "revolution", "profile_m": PROFILE, "segments": 2}, "shape.segments"),
         ({"kind": "box", "size_m": [1.0, 1.0]}, "shape.size_m"),
+        ({"kind": "box", "size_m": [1.0, 1.0, np.inf]}, "shape.size_m"),
+        ({"kind": "box", "size_m": [1.0, 1.0, 0.0]}, "shape.size_m"),
+        ({"kind": "box", "size_m": [1.0, 1.0, 1.0], "center_m": [0, 0, np.nan]}, "shape.center_m"),
+        ({"kind": "file", "path": __file__, "scale": np.inf}, "shape.scale"),
         ({"kind": "file", "path": "nowhere/drum.stl"}, "shape.path"),
     ],
 )
