@@ -32,7 +32,7 @@ from gns_pyg.evaluation.predict import start_frame, write_rollout
 from gns_pyg.report.page import write_page
 from gns_pyg.report.plots import write_plots
 from gns_pyg.report.table import metrics_table
-from gns_pyg.scene.boundary_points import sample_boundary_points
+from gns_pyg.scene.boundary_points import check_density, sample_boundary_points
 from gns_pyg.scene.mesh import build_mesh
 from gns_pyg.scene.scene import Scene
 from gns_pyg.training.config import TrainingConfig
@@ -107,10 +107,11 @@ def rollout(cfg: DictConfig) -> dict[str, Any]:
 def build(scene: Scene, config: ModelConfig, cases: Split, seed: int) -> Simulator:
     """A new simulator for a scene, its scales measured on the training cases, its weights drawn from `seed`."""
     statistics = measure(cases.train, Integrator(scene, config.state, residual=config.residual))
-    points = {
-        name: sample_boundary_points(build_mesh(name, part), part.points, scene.seed)
-        for name, part in scene.boundary.items()
-    }
+    points = {}
+    for name, part in scene.boundary.items():
+        mesh, radius_m = build_mesh(name, part), scene.grains.radius_m
+        points[name] = sample_boundary_points(mesh, part.points, scene.seed)
+        check_density(name, points[name], mesh, config.cutoff_wall_radii * radius_m, radius_m)
     with torch.random.fork_rng():
         torch.manual_seed(seed)
         return Simulator(scene, config, points, statistics)

@@ -5,7 +5,13 @@ from hydra import compose, initialize_config_dir
 from gns_pyg import run
 from gns_pyg.config import CONF
 
-TINY = ["model.hidden=8", "training.batch_size=1", "callbacks.rollout_metrics=null", "start_s=1.15"]
+TINY = [
+    "model.hidden=8",
+    "training.batch_size=1",
+    "training.unroll=2",
+    "callbacks.rollout_metrics=null",
+    "start_s=1.15",
+]
 
 
 def config(folder, *overrides, name="train"):
