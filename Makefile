@@ -23,5 +23,5 @@ demo: setup
 test: setup
 	$(BIN)/ruff check -q .
 	$(BIN)/ruff format -q --check .
-	$(BIN)/mypy -p gns_pyg
+	$(BIN)/mypy -p gns_pyg -p data_gen
 	$(BIN)/python -m pytest
