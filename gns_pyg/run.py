@@ -143,7 +143,7 @@ def build_trainer(cfg: DictConfig, training: TrainingConfig, where: torch.device
     except (TypeError, ValueError, InstantiationException, MisconfigurationException) as error:
         raise ConfigError(
             "trainer, logger or callbacks",
-            str(error).splitlines()[0],
+            " ".join(str(error).split()),
             "keys and values of the classes that conf/trainer, conf/logger and conf/callbacks name",
             "correct or remove the key",
         ) from None

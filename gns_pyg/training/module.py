@@ -42,7 +42,9 @@ class TrainingModule(pl.LightningModule):
         """The simulator that is evaluated and saved: the averaged one where there is one."""
         return self.simulator if self.average is None else cast(Simulator, self.average.module)
 
-    def on_train_batch_end(self, outputs: Any, batch: Window, batch_idx: int) -> None:
+    def optimizer_step(self, *args: Any, **kwargs: Any) -> None:
+        """Averages right after the step, so that a checkpoint of this update holds this update's average."""
+        super().optimizer_step(*args, **kwargs)
         if self.average is not None:
             self.average.update_parameters(self.simulator)
 

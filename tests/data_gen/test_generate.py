@@ -179,7 +179,11 @@ class TestCommand:
 
     def test_ctrl_c_ends_yade_and_leaves_nothing(self, tmp_path) -> None:
         process = subprocess.Popen(
-            command(tmp_path, "scene.duration_s=100"), cwd=ROOT, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL
+            command(tmp_path, "scene.duration_s=100"),
+            cwd=ROOT,
+            stdout=subprocess.DEVNULL,
+            stderr=subprocess.DEVNULL,
+            preexec_fn=lambda: signal.signal(signal.SIGINT, signal.SIG_DFL),  # background jobs inherit it ignored
         )
         part = wait_for(lambda: next(tmp_path.glob(".case_000.h5.*.part"), None))
         process.send_signal(signal.SIGINT)

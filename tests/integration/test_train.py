@@ -150,7 +150,7 @@ def test_a_checkpoint_of_another_config_is_refused_with_the_difference(trained, 
     with pytest.raises(ConfigError, match="model.hidden = 8"):
         train(tmp_path, "experiment=hopper", f"ckpt_path={checkpoint}", "model.hidden=4")
     with pytest.raises(ConfigError, match="no such file"):
-        train(tmp_path, "experiment=hopper", "ckpt_path=nowhere.ckpt")
+        train(tmp_path / "other", "experiment=hopper", "ckpt_path=nowhere.ckpt")
 
 
 def test_a_run_can_be_lengthened(tmp_path):
@@ -247,7 +247,7 @@ def test_non_finite_loss_stops_with_the_update_named(tmp_path):
         ("start_s=99", DataError, "start_s"),
         ("+foo=3", ConfigError, "foo"),
         ("+trainer.presision=16", ConfigError, "presision"),
-        ("+callbacks.progress.evry=3", ConfigError, "evry"),
+        ("+callbacks.checkpoint.evry=3", ConfigError, "evry"),
         ("device=tpu", ConfigError, "device"),
     ],
 )
