@@ -70,7 +70,8 @@ def metric_rows(metrics: Mapping[str, Any]) -> list[tuple[str, str, str]]:
     factor = ""
     if own is not None and yade is not None and own > 0:
         factor = f", network {yade / own:.3g} times as fast"
-    threads = f" (on {_count(metrics['speed/threads'])} threads)" if "speed/threads" in metrics else ""
+    n_threads = metrics.get("speed/threads")
+    threads = f" (on {n_threads} thread{'' if n_threads == 1 else 's'})" if n_threads else ""
     cores, yade_dt = (
         _count(metrics.get("speed/yade_cores")),
         _number(metrics.get("speed/yade_dt_s"), 1e6, " \N{MICRO SIGN}s"),
