@@ -70,7 +70,8 @@ def train(cfg: DictConfig) -> dict[str, Any]:
     )
     simulator = build(scene, model, cases, training.seed)
     log.info("model: %d parameters", sum(p.numel() for p in simulator.parameters()))
-    identity = flat({"model": asdict(model), "training": asdict(training), "cases": cases.describe()})
+    used = cases.describe()
+    identity = flat({"model": asdict(model), "training": asdict(training), "cases": used})
     del identity["training.updates"]  # a run may be lengthened
     module = TrainingModule(simulator, training, identity)
     trainer = build_trainer(cfg, training, where)
@@ -78,7 +79,7 @@ def train(cfg: DictConfig) -> dict[str, Any]:
     trainer.save_checkpoint(folder / "checkpoints" / "last.ckpt")
     trained = module.judged.eval().to(where)
     expected = climatology(cases.train, scene)
-    card = {"cases": cases.describe(), "training": plain(cfg.training), "climatology": asdict(expected)}
+    card = {"cases": used, "training": plain(cfg.training), "climatology": asdict(expected)}
     bundle.save(folder / "bundle", trained, strict(card))
     metrics = report(trained, cases.test, expected, cfg, {"bundle": folder / "bundle"})
     bundle.save(folder / "bundle", trained, strict(card | {"metrics": metrics}))

@@ -253,7 +253,7 @@ def _evaluate_case(result: CaseResult, trivial_name: str, climatology: Climatolo
         "test/rollout_error_final_frozen_m": float(frozen[-1]),
         "test/center_of_mass_error_max_m": _largest_distance(model.center_of_mass_m, center),
         "test/center_of_mass_error_frozen_max_m": _largest_distance(center[:1], center),
-        "test/center_of_mass_error_climatology_max_m": _largest_distance(expected, center),
+        "test/center_of_mass_error_climatology_max_m": climatology.center_of_mass_error_m(result.times_s, center),
     }
     if dem.angle_of_repose_deg is not None and model.angle_of_repose_deg is not None:
         steady = slice(from_frame(result.times_s, scene), None)
