@@ -24,7 +24,13 @@ from gns_pyg.errors import DataError, GnsError
 from gns_pyg.scene.mesh import build_mesh, same_mesh
 from gns_pyg.scene.scene import Scene
 
-READ_LATER = ("cases", "angle_of_repose", "points")  # keys of a scene that do not influence its DEM run
+READ_LATER = (
+    "cases",
+    "angle_of_repose",
+    "points",
+    "state",
+    "vary",
+)  # keys of a scene that do not influence its DEM run
 
 
 def generate(config: DictConfig) -> Path:

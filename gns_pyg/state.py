@@ -8,7 +8,7 @@ from dataclasses import dataclass, fields, replace
 from typing import TypeVar
 
 import torch
-from jaxtyping import Float, Int
+from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
 AnyRecord = TypeVar("AnyRecord", bound="Record")
@@ -39,6 +39,8 @@ class State(Record):
         radius: grain radius, m, float64.
         time_s: time of each graph, s; walls move with it.
         batch: graph of each grain, sorted.
+        parameters: what may vary from case to case, in the order of `scene.PARAMETERS`, SI; None where nothing does.
+        active: whether a grain is in the scene, or None where grains neither leave nor enter.
     """
 
     pos: Float[Tensor, "n_grains 3"]
@@ -47,10 +49,24 @@ class State(Record):
     radius: Float[Tensor, " n_grains"]
     time_s: Float[Tensor, " n_graphs"]
     batch: Int[Tensor, " n_grains"]
+    parameters: Float[Tensor, "n_graphs n_parameters"] | None = None
+    active: Bool[Tensor, " n_grains"] | None = None
 
     @property
     def n_graphs(self) -> int:
         return self.time_s.shape[0]
+
+    def pick(self, grains: Bool[Tensor, " n_grains"]) -> "State":
+        """The state of some of the grains, all of them active; graphs stay."""
+        return replace(
+            self,
+            pos=self.pos[grains],
+            vel=self.vel[grains],
+            ang_vel=None if self.ang_vel is None else self.ang_vel[grains],
+            radius=self.radius[grains],
+            batch=self.batch[grains],
+            active=None,
+        )
 
 
 @dataclass(frozen=True)
@@ -64,6 +80,8 @@ class Window(Record):
         radius: grain radius, m, float64.
         time_s: time of frame 0 of each graph, s.
         batch: graph of each grain, sorted.
+        parameters: of each graph, in the order of `scene.PARAMETERS`, SI.
+        active: whether a grain is in the scene, or None where grains neither leave nor enter.
     """
 
     pos: Float[Tensor, "n_frames n_grains 3"]
@@ -72,11 +90,14 @@ class Window(Record):
     radius: Float[Tensor, " n_grains"]
     time_s: Float[Tensor, " n_graphs"]
     batch: Int[Tensor, " n_grains"]
+    parameters: Float[Tensor, "n_graphs n_parameters"]
+    active: Bool[Tensor, "n_frames n_grains"] | None = None
 
     @staticmethod
     def collate(windows: "list[Window]") -> "Window":
         """Joins single-graph windows of equal length into one batch."""
         sizes = torch.tensor([w.radius.shape[0] for w in windows])
+        active = [w.active for w in windows if w.active is not None]
         return Window(
             pos=torch.cat([w.pos for w in windows], 1),
             vel=torch.cat([w.vel for w in windows], 1),
@@ -84,6 +105,8 @@ class Window(Record):
             radius=torch.cat([w.radius for w in windows]),
             time_s=torch.cat([w.time_s for w in windows]),
             batch=torch.repeat_interleave(torch.arange(len(windows)), sizes),
+            parameters=torch.cat([w.parameters for w in windows]),
+            active=torch.cat(active, 1) if active else None,
         )
 
 

@@ -67,6 +67,11 @@ def _wrong_grains(grains: h5py.Group, creator: str) -> list[str]:
         elif not (np.isfinite(time[:]).all() and (np.diff(time[:]) > 0).all()):
             wrong.append(f"{where}/time: not finite and strictly increasing")
         wrong += _not_finite(value, f"{where}/value")
+    if "active" in grains and (active := _dataset(grains, "active/value", None, wrong)) is not None:
+        if active.shape != size or active.dtype != np.uint8:
+            wrong.append(f"/{GRAINS}/active/value: {active.dtype} {active.shape}, expected uint8 {size}")
+        elif not (active[:] <= 1).all():
+            wrong.append(f"/{GRAINS}/active/value: holds a value that is neither 0 nor 1")
     for name, unit in FIXED_UNITS.items():
         if (fixed := _dataset(grains, name, unit, wrong)) is None:
             continue

@@ -27,6 +27,7 @@ class Trajectory:
         times_s: (n_frames,) float64.
         radius, mass: (n_grains,) float64, m and kg.
         scene: the scene as resolved, a plain dict.
+        has_active: whether grains leave or enter, so that not all of them are there in every frame.
         run: the run that made it: wall_clock_s, cores, steps, dt_s, creator, creator_version, case, ...
 
     Raises:
@@ -58,6 +59,7 @@ class Trajectory:
     def _read_fixed(self, file: h5py.File) -> None:
         grains = file[GRAINS]
         self.n_frames, self.n_grains = grains["position/value"].shape[:2]
+        self.has_active = "active" in grains
         self.times_s = grains["position/time"][:].astype(np.float64)
         self.radius = grains["radius"][:].astype(np.float64)
         self.mass = grains["mass"][:].astype(np.float64)
@@ -72,6 +74,14 @@ class Trajectory:
         if field not in self._file[GRAINS]:
             raise DataError(self.path, f"no {field}", f"the field {field}", "use a DEM run, which stores all fields")
         return self._file[GRAINS][field]["value"][start:stop].astype(np.float64)
+
+    def active(self, start: int = 0, stop: int | None = None) -> np.ndarray:
+        """Whether each grain is in the scene in frames [start, stop), bool (n, n_grains)."""
+        if not self.has_active:
+            return np.ones((len(range(self.n_frames)[start:stop]), self.n_grains), bool)
+        if self._file is None:
+            self._file = h5py.File(self.path, "r")
+        return self._file[GRAINS]["active/value"][start:stop].astype(bool)
 
     @property
     def boundary(self) -> dict[str, dict[str, Any]]:
@@ -111,6 +121,7 @@ class TrajectoryWriter:
         boundary: part name -> {"vertices": (n, 3) m, "triangles": (m, 3), "motion": dict}.
         decimals: digits kept after the point (HDF5's scale-offset filter, SI units) of every field to be written:
             all three for a DEM run; a model whose state has no rotation leaves `angular_velocity` out.
+        with_active: grains leave or enter, so that every frame says which ones are there.
     """
 
     def __init__(
@@ -121,6 +132,7 @@ class TrajectoryWriter:
         mass: np.ndarray,
         boundary: Mapping[str, Mapping[str, Any]],
         decimals: Mapping[str, int],
+        with_active: bool = False,
     ) -> None:
         self.path = Path(path)
         self.path.parent.mkdir(parents=True, exist_ok=True)
@@ -144,7 +156,17 @@ class TrajectoryWriter:
         self._fields = [name for name in UNITS if name in decimals]
         for name in self._fields:
             self._create_field(grains.create_group(name), UNITS[name], decimals[name])
-        for name in self._fields[1:]:  # H5MD: elements sampled together share step and time
+        if with_active:
+            grains.create_group("active").create_dataset(
+                "value",
+                (0, self._n_grains),
+                np.uint8,
+                maxshape=(None, self._n_grains),
+                chunks=(CHUNK_FRAMES, self._n_grains),
+                compression="gzip",
+            )
+        self._shared = [*self._fields[1:], *(["active"] if with_active else [])]
+        for name in self._shared:  # H5MD: elements sampled together share step and time
             for shared in ("step", "time"):
                 grains[name][shared] = grains["position"][shared]
         for name, part in boundary.items():
@@ -172,9 +194,15 @@ class TrajectoryWriter:
         value.attrs["unit"] = unit
 
     def append(
-        self, step: int, time_s: float, pos: np.ndarray, vel: np.ndarray, ang_vel: np.ndarray | None = None
+        self,
+        step: int,
+        time_s: float,
+        pos: np.ndarray,
+        vel: np.ndarray,
+        ang_vel: np.ndarray | None = None,
+        active: np.ndarray | None = None,
     ) -> None:
-        """Adds a frame: grain centres (n_grains, 3) m, velocities m/s, angular velocities rad/s.
+        """Adds a frame: grain centres (n_grains, 3) m, velocities m/s, angular velocities rad/s, who is there (bool).
 
         Raises:
             DataError: if a value is not finite; nothing of this frame is written.
@@ -194,6 +222,9 @@ class TrajectoryWriter:
             # The filter counts its steps from a chunk's smallest value: rounded values keep zero (at rest) zero.
             self._pending[name].append(np.round(values, self._decimals[name]))
         grains = self._file[GRAINS]
+        if "active" in self._shared:
+            grains["active/value"].resize(self._n_frames + 1, axis=0)
+            grains["active/value"][self._n_frames] = active
         for name, value in (("step", step), ("time", time_s)):
             grains["position"][name].resize((self._n_frames + 1,))
             grains["position"][name][self._n_frames] = value

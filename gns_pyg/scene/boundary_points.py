@@ -9,6 +9,8 @@ from trimesh import Trimesh
 
 from gns_pyg.config import require
 from gns_pyg.errors import GeometryError
+from gns_pyg.scene.mesh import build_mesh
+from gns_pyg.scene.scene import Scene
 
 CANDIDATES_PER_POINT = 5
 TESTS_PER_POINT = 20  # places of the surface that `check_density` looks at
@@ -28,6 +30,16 @@ class BoundaryPoints:
 
     pos: np.ndarray
     normal: np.ndarray
+
+
+def boundary_points(scene: Scene, cutoff_wall_radii: float) -> dict[str, BoundaryPoints]:
+    """The points of every boundary part of a scene, dense enough for its smallest grains (see `check_density`)."""
+    points, radius_m = {}, scene.grains.radii_m[0]
+    for name, part in scene.boundary.items():
+        mesh = build_mesh(name, part)
+        points[name] = sample_boundary_points(mesh, part.points, scene.seed)
+        check_density(name, points[name], mesh, cutoff_wall_radii * radius_m, radius_m)
+    return points
 
 
 def sample_boundary_points(mesh: Trimesh, n: int, seed: int = 0) -> BoundaryPoints:

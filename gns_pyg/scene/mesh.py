@@ -2,7 +2,7 @@
 
 import math
 from collections.abc import Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
@@ -20,10 +20,14 @@ BLOCK = 20_000  # point-triangle pairs handled at once: few enough to stay in th
 
 @dataclass
 class Revolution:
-    """`profile_m` ([[radius, z], ...] from the bottom up) turned about z and closed to the axis at both ends."""
+    """`profile_m` ([[radius, z], ...] from the bottom up) turned about z and closed to the axis at both ends.
+
+    `open_bottom` leaves the lower lid out (above a scene's outlet); grains are then still on the inner side.
+    """
 
     profile_m: list[Any] = MISSING  # pairs of numbers: OmegaConf would refuse whole ones in nested lists of floats
     segments: int = 48
+    open_bottom: bool = False
 
     def mesh(self, where: str) -> Trimesh:
         key, remedy = f"{where}.profile_m", f"correct {where}.profile_m, e.g. [[0.1, 0], [0.1, 0.3]]"
@@ -36,7 +40,12 @@ class Revolution:
         require(radii_ok, key, self.profile_m, "radii of at least 0, not all of them 0", remedy)
         require(bool(np.ptp(profile[:, 1]) > 0), key, self.profile_m, "points at different heights z", remedy)
         require(self.segments >= 3, f"{where}.segments", self.segments, "at least 3", "e.g. 48")
-        return _revolve(profile, self.segments)
+        mesh = _revolve(profile, self.segments)
+        if self.open_bottom:
+            mesh.update_faces((mesh.triangles[:, :, 2] > profile[0, 1]).any(axis=1))
+            mesh.remove_unreferenced_vertices()
+            mesh.invert()
+        return mesh
 
 
 @dataclass
@@ -75,6 +84,22 @@ class Box:
 
 
 @dataclass
+class Floor:
+    """Horizontal rectangle with edges along x and y; grains are above it."""
+
+    size_m: list[float] = MISSING
+    center_m: list[float] = field(default_factory=lambda: [0.0, 0.0, 0.0])
+
+    def mesh(self, where: str) -> Trimesh:
+        size_ok = finite(self.size_m, 2) and min(self.size_m) > 0
+        require(size_ok, f"{where}.size_m", self.size_m, "two finite lengths above 0 m", "e.g. [0.6, 0.6]")
+        center_ok = finite(self.center_m, 3)
+        require(center_ok, f"{where}.center_m", self.center_m, "three finite numbers", "e.g. [0, 0, 0]")
+        corners = np.array([[-0.5, -0.5, 0], [0.5, -0.5, 0], [0.5, 0.5, 0], [-0.5, 0.5, 0]]) * [*self.size_m, 0.0]
+        return Trimesh(corners + self.center_m, [[0, 1, 2], [0, 2, 3]], process=False)
+
+
+@dataclass
 class File:
     """A mesh file that trimesh reads (STL, OBJ, PLY, ...); `scale` turns its unit into metres (0.001 for mm)."""
 
@@ -104,7 +129,7 @@ class File:
         return mesh.apply_scale(self.scale)
 
 
-SHAPES = {"revolution": Revolution, "cylinder": Cylinder, "box": Box, "file": File}
+SHAPES = {"revolution": Revolution, "cylinder": Cylinder, "box": Box, "floor": Floor, "file": File}
 
 
 def build_mesh(name: str, part: Part) -> Trimesh:
@@ -128,8 +153,23 @@ def build_mesh(name: str, part: Part) -> Trimesh:
     record: Any = typed(SHAPES[kind], shape, where)
     mesh: Trimesh = record.mesh(where)
     if mesh.is_watertight and mesh.volume < 0:
+        if kind == "file":
+            raise GeometryError(
+                record.path,
+                f"normals that point inwards (it encloses {mesh.volume * 1e3:.3g} litres)",
+                "a closed surface whose normals point outwards; grains are inside",
+                "flip its normals and export it again",
+            )
         mesh.invert()
     return mesh
+
+
+def container(name: str, part: Part) -> Trimesh | None:
+    """The closed surface, m, that a part holds grains in: its mesh, with the lid that `open_bottom` left out; None
+    for a part that encloses nothing (a floor)."""
+    shape = {key: value for key, value in part.shape.items() if key != "open_bottom"}
+    mesh = build_mesh(name, replace(part, shape=shape))
+    return mesh if mesh.is_watertight else None
 
 
 def require_closed(mesh: Trimesh, where: str) -> None:

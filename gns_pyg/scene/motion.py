@@ -5,35 +5,52 @@ from jaxtyping import Float
 from torch import Tensor
 
 from gns_pyg.scene.scene import Motion
+from gns_pyg.scene.travel import travel
+
+STEP_S = 1e-30  # of the complex-step derivative: no difference is taken, so it cannot be too small
 
 
 def rotation(motion: Motion, time_s: Float[Tensor, " b"]) -> Float[Tensor, "b 3 3"]:
     """Rotation from the body frame to the world frame at each time (Rodrigues' formula)."""
     eye = torch.eye(3, dtype=time_s.dtype, device=time_s.device).expand(len(time_s), 3, 3)
-    if not motion.moves:
+    if motion.kind != "rotation":
         return eye
     x, y, z = _axis(motion, time_s).tolist()
     cross = torch.tensor([[0, -z, y], [z, 0, -x], [-y, x, 0]], dtype=time_s.dtype, device=time_s.device)
-    angle = (motion.rate_rad_s * time_s)[:, None, None]
+    angle = way(motion, time_s)[0][:, None, None]
     return eye + torch.sin(angle) * cross + (1 - torch.cos(angle)) * (cross @ cross)
 
 
+def way(motion: Motion, time_s: Float[Tensor, " b"]) -> tuple[Float[Tensor, " b"], Float[Tensor, " b"]]:
+    """How far a part has come at each time (rad or m) and how fast it moves (rad/s or m/s).
+
+    The speed is the complex-step derivative (Squire and Trapp 1998): exact for the analytic functions of `travel`.
+    """
+    stepped = travel(motion, torch.complex(time_s, torch.full_like(time_s, STEP_S)), torch)
+    stepped = stepped + torch.zeros_like(time_s)  # a constant function has no shape of its own
+    return stepped.real, stepped.imag / STEP_S
+
+
 def to_world(
-    motion: Motion, points: Float[Tensor, "p 3"], time_s: Float[Tensor, " b"]
-) -> tuple[Float[Tensor, "b p 3"], Float[Tensor, "b p 3"]]:
-    """Places body-frame points at each time; returns their world positions, m, and velocities, m/s."""
-    origin = _origin(motion, points)
-    arm = (points - origin) @ rotation(motion, time_s).transpose(1, 2)
+    motion: Motion, points: Float[Tensor, "n 3"], time_s: Float[Tensor, " n"]
+) -> tuple[Float[Tensor, "n 3"], Float[Tensor, "n 3"]]:
+    """Places body-frame points, each at its own time; returns their world positions, m, and velocities, m/s."""
     if not motion.moves:
-        return arm + origin, torch.zeros_like(arm)
-    spin = (motion.rate_rad_s * _axis(motion, points)).expand_as(arm)
-    return arm + origin, torch.linalg.cross(spin, arm)
+        return points, torch.zeros_like(points)
+    come, speed = (value[:, None] * _axis(motion, points) for value in way(motion, time_s))
+    if motion.kind != "rotation":
+        return points + come, speed
+    origin = _origin(motion, points)
+    arm = torch.einsum("nij,nj->ni", rotation(motion, time_s), points - origin)
+    return arm + origin, torch.linalg.cross(speed, arm)
 
 
 def to_body(motion: Motion, pos: Float[Tensor, "n 3"], time_s: Float[Tensor, " n"]) -> Float[Tensor, "n 3"]:
     """Takes world positions, each at its own time, into the part's body frame; inverse of `to_world`."""
     if not motion.moves:
         return pos
+    if motion.kind != "rotation":
+        return pos - way(motion, time_s)[0][:, None] * _axis(motion, pos)
     origin = _origin(motion, pos)
     return torch.einsum("nji,nj->ni", rotation(motion, time_s), pos - origin) + origin
 

@@ -3,15 +3,19 @@
 These records are also OmegaConf schemas, hence plain containers and no unions beyond primitives.
 """
 
+import itertools
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass, field
+from copy import copy
+from dataclasses import dataclass, field, replace
 from numbers import Real
 from typing import Any, Union
 
 from omegaconf import MISSING
 
 from gns_pyg.config import require, typed
+from gns_pyg.errors import ConfigError
+from gns_pyg.scene.travel import FUNCTION, travel
 
 
 def positive(where: str, value: float, unit: str = "") -> None:
@@ -53,15 +57,52 @@ class Material:
 
 @dataclass
 class Grains:
-    """Spheres of one radius and one material."""
+    """Spheres of one or several radii and one material.
+
+    Attributes:
+        count: grains in all; with an inlet, those that enter later too.
+        radius_m: a number, or a list of them (several sizes).
+        share: part of the grains that has each radius, by number; empty is equal parts.
+        shape: only `sphere`.
+    """
 
     count: int = MISSING
-    radius_m: float = MISSING
+    radius_m: Any = MISSING
     material: Material = MISSING
+    share: list[float] = field(default_factory=list)
+    shape: str = "sphere"
 
     def __post_init__(self) -> None:
         require(self.count > 0, "scene.grains.count", self.count, "at least 1", "set it to the number of grains")
-        positive("scene.grains.radius_m", self.radius_m, "m")
+        require(
+            self.shape == "sphere",
+            "scene.grains.shape",
+            self.shape,
+            "sphere; other shapes (clumps) need each grain's orientation and inertia in the state, contacts between "
+            "members, and their storage in the trajectory, none of which is there yet",
+            "use spheres, with a higher friction angle to stand for the shape",
+        )
+        key, radii = "scene.grains.radius_m", self.radius_m if isinstance(self.radius_m, list) else [self.radius_m]
+        numbers = bool(radii) and all(isinstance(r, Real) and math.isfinite(r) and r > 0 for r in radii)
+        require(numbers, key, self.radius_m, "a finite number above 0 m, or a list of them", f"e.g. {key}=0.01")
+        require(len(set(radii)) == len(radii), key, self.radius_m, "every radius once", "give its part in share")
+        share, key = self.share, "scene.grains.share"
+        known = f"one number above 0 for each of the {len(radii)} radii, 1 in all"
+        fits = not share or (len(share) == len(radii) and min(share) > 0 and abs(sum(share) - 1) < 1e-6)
+        require(fits, key, share, known, "e.g. radius_m: [0.008, 0.012] with share: [0.6, 0.4]")
+
+    @property
+    def radii_m(self) -> list[float]:
+        """Every radius that grains have, m, smallest first."""
+        return sorted(float(r) for r in (self.radius_m if isinstance(self.radius_m, list) else [self.radius_m]))
+
+    @property
+    def counts(self) -> list[tuple[float, int]]:
+        """(radius, m; number of grains), in the order of `radius_m`."""
+        radii = self.radius_m if isinstance(self.radius_m, list) else [self.radius_m]
+        until = [0.0, *itertools.accumulate(self.share or [1 / len(radii)] * len(radii))]
+        ends = [round(self.count * part) for part in until]
+        return [(float(r), b - a) for r, (a, b) in zip(radii, itertools.pairwise(ends), strict=True)]
 
 
 @dataclass
@@ -72,6 +113,7 @@ class Initial:
         arrangement: `random` (random sequential addition in the region) or `dense` (the sites of a randomly
             oriented close-packed lattice nearest to a random point).
         z_min_m, z_max_m: grain centres lie between these heights; None is no limit.
+        region_m: opposite corners of a box that grain centres lie in; needed where no boundary part encloses them.
         speed_max_m_s: each velocity component is uniform in [-speed_max_m_s, speed_max_m_s].
     """
 
@@ -79,8 +121,14 @@ class Initial:
     speed_max_m_s: float = MISSING
     z_min_m: float | None = None
     z_max_m: float | None = None
+    region_m: list[Any] = field(default_factory=list)
 
     def __post_init__(self) -> None:
+        corners = self.region_m
+        box = not corners or (len(corners) == 2 and all(isinstance(c, list) and finite(c, 3) for c in corners))
+        box = box and all(low < high for low, high in zip(*corners, strict=True))
+        known_box = "[[x, y, z], [x, y, z]], the lower and the upper corner"
+        require(box, "scene.initial.region_m", corners, known_box, "e.g. [[-0.1, -0.1, 0], [0.1, 0.1, 0.3]]")
         known = ("random", "dense")
         require(
             self.arrangement in known, "scene.initial.arrangement", self.arrangement, " or ".join(known), "pick one"
@@ -90,33 +138,58 @@ class Initial:
 
 @dataclass
 class Motion:
-    """Rigid motion of a boundary part. `none`, or `rotation` about the line through `origin_m` along `axis`."""
+    """Rigid motion of a boundary part along or about `axis`, exact at every time.
+
+    Attributes:
+        kind: `none`; `rotation` about the line through `origin_m`; `translation`; `oscillation` (a sine way).
+        axis: direction of the rotation axis or of the way.
+        rate_rad_s: of a rotation.
+        speed_m_s: of a translation.
+        amplitude_m, frequency_hz: of an oscillation; its way is amplitude_m sin(2 pi frequency_hz t).
+        function: instead of a constant rate or speed: the angle in rad, or the way in m, as a function of t in s,
+            0 at t = 0, e.g. "0.5 * t**2" (see `scene.travel`).
+    """
 
     kind: str = "none"
     axis: list[float] = field(default_factory=list)
     origin_m: list[float] = field(default_factory=lambda: [0.0, 0.0, 0.0])
     rate_rad_s: float = 0.0
+    speed_m_s: float = 0.0
+    amplitude_m: float = 0.0
+    frequency_hz: float = 0.0
+    function: str | None = None
 
     def check(self, where: str) -> None:
         """Raises ConfigError for a value out of range; `where` is this record's key, which only the scene knows."""
-        known = ("none", "rotation")
+        known = {"none": (), "rotation": ("rate_rad_s",), "translation": ("speed_m_s",)}
+        known["oscillation"] = ("amplitude_m", "frequency_hz")
         require(self.kind in known, f"{where}.kind", self.kind, " or ".join(known), "pick one of them")
-        if self.kind == "rotation":
-            require(
-                finite(self.axis, 3) and any(self.axis),
-                f"{where}.axis",
-                self.axis,
-                "three finite numbers that are not all 0",
-                "give the direction of the rotation axis, e.g. [1, 0, 0]",
-            )
+        for key in {key for keys in known.values() for key in keys}:
+            value = getattr(self, key)
+            require(math.isfinite(value), f"{where}.{key}", value, "a finite number", "e.g. 3.0")
+            owner = next(kind for kind, keys in known.items() if key in keys)
+            belongs = value == 0 or self.kind == owner
+            require(belongs, f"{where}.{key}", value, f"0 for a {self.kind}", f"set {where}.kind={owner}, or remove it")
+        if self.kind != "none":
+            axis_ok, direction = finite(self.axis, 3) and any(self.axis), "give its direction, e.g. [1, 0, 0]"
+            require(axis_ok, f"{where}.axis", self.axis, "three finite numbers that are not all 0", direction)
             origin_ok = finite(self.origin_m, 3)
             require(origin_ok, f"{where}.origin_m", self.origin_m, "three finite numbers", "e.g. [0, 0, 0]")
-            rate_ok = math.isfinite(self.rate_rad_s)
-            require(rate_ok, f"{where}.rate_rad_s", self.rate_rad_s, "a finite number", "e.g. 3.0")
+        if self.function is None:
+            return
+        key, constant = f"{where}.function", self.rate_rad_s or self.speed_m_s
+        takes = self.kind in ("rotation", "translation") and not constant
+        require(takes, key, self.function, "a rotation or translation without a constant rate", "remove one of them")
+        try:
+            at_start = travel(self, 0.0, math)
+        except (ValueError, ArithmeticError) as error:
+            raise ConfigError(key, f"{self.function!r}: {error}", FUNCTION, "e.g. '0.2 * sin(6.28 * t)'") from None
+        require(abs(at_start) < 1e-9, key, f"{self.function!r} is {at_start:g} at t = 0", "0 there", "subtract it")
 
     @property
     def moves(self) -> bool:
-        return self.kind == "rotation" and self.rate_rad_s != 0.0
+        oscillates = self.amplitude_m * self.frequency_hz != 0.0
+        return self.function is not None or self.rate_rad_s != 0.0 or self.speed_m_s != 0.0 or oscillates
 
 
 @dataclass
@@ -124,8 +197,9 @@ class Part:
     """One rigid part of the boundary; grains lie inside a closed part, or on the winding side of an open one.
 
     Attributes:
-        shape: `{kind: revolution, profile_m: [[radius, z], ...], segments}`, `{kind: cylinder, radius_m, length_m,
-            axis, segments}`, `{kind: box, size_m, center_m}` or `{kind: file, path, scale}` (STL, OBJ, ...).
+        shape: `{kind: revolution, profile_m: [[radius, z], ...], segments, open_bottom}`, `{kind: cylinder, radius_m,
+            length_m, axis, segments}`, `{kind: box, size_m, center_m}`, `{kind: floor, size_m, center_m}` or
+            `{kind: file, path, scale}` (STL, OBJ, ...).
         points: number of boundary points the network sees.
         friction_angle_rad: wall friction angle, rad.
     """
@@ -163,6 +237,53 @@ class AngleOfRepose:
 
 
 @dataclass
+class Outlet:
+    """A plane that grains leave the scene through: gone from the first frame on at which their centre is beyond it.
+
+    Attributes:
+        point_m: a point of the plane.
+        normal: points out of the scene.
+    """
+
+    point_m: list[float] = field(default_factory=list)
+    normal: list[float] = field(default_factory=list)
+
+    def __post_init__(self) -> None:
+        where, example = "scene.outlet", "e.g. point_m: [0, 0, 0] with normal: [0, 0, -1]"
+        require(finite(self.point_m, 3), f"{where}.point_m", self.point_m, "three finite numbers", example)
+        normal_ok = finite(self.normal, 3) and any(self.normal)
+        require(normal_ok, f"{where}.normal", self.normal, "three finite numbers that are not all 0", example)
+
+
+@dataclass
+class Inlet:
+    """A horizontal rectangle that grains enter the scene through, one after the other (see `scene.inlet`).
+
+    Attributes:
+        count: grains that enter; they are the last ones of `scene.grains.count`.
+        rate_per_s: grains per second.
+        center_m, size_m: middle (three numbers) and edges (two numbers) of the rectangle.
+        velocity_m_s: of an entering grain (three numbers).
+    """
+
+    count: int = 0
+    rate_per_s: float = 0.0
+    center_m: list[float] = field(default_factory=list)
+    size_m: list[float] = field(default_factory=list)
+    velocity_m_s: list[float] = field(default_factory=list)
+
+    def __post_init__(self) -> None:
+        where = "scene.inlet"
+        require(self.count >= 1, f"{where}.count", self.count, "at least 1", "set it to the number that enters")
+        rate = self.rate_per_s
+        require(math.isfinite(rate) and rate > 0, f"{where}.rate_per_s", rate, "grains per second, above 0", "e.g. 200")
+        for key, n in (("center_m", 3), ("size_m", 2), ("velocity_m_s", 3)):
+            value = getattr(self, key)
+            require(finite(value, n), f"{where}.{key}", value, f"{n} finite numbers", "see docs/scenes.md")
+        require(min(self.size_m) > 0, f"{where}.size_m", self.size_m, "two lengths above 0 m", "e.g. [0.1, 0.1]")
+
+
+@dataclass
 class Dem:
     """How Yade runs. `dt_s` is a number or `auto` (a third of the P-wave step)."""
 
@@ -177,9 +298,18 @@ class Dem:
             positive("scene.dem.dt_s", float(self.dt_s), "s")
 
 
+PARAMETERS = ("density_kg_m3", "young_modulus_pa", "poisson_ratio", "friction_angle_rad", "damping")
+
+
 @dataclass
 class Scene:
-    """Everything that defines a granular scene. Lengths in m, times in s, angles in rad."""
+    """Everything that defines a granular scene. Lengths in m, times in s, angles in rad.
+
+    Attributes:
+        vary: parameters (of PARAMETERS) that change from case to case -> their values; case n has value n modulo
+            their number (see `of_case`).
+        state: what a model's state must hold, as `data_gen.restart` measured it (see docs/state.md).
+    """
 
     name: str = MISSING
     duration_s: float = MISSING
@@ -194,6 +324,10 @@ class Scene:
     boundary: dict[str, Part] = field(default_factory=dict)
     dem: Dem = field(default_factory=Dem)
     angle_of_repose: AngleOfRepose | None = None
+    outlet: Outlet | None = None
+    inlet: Inlet | None = None
+    vary: dict[str, list[float]] = field(default_factory=dict)
+    state: str = "full"
 
     def __post_init__(self) -> None:
         positive("scene.duration_s", self.duration_s, "s")
@@ -214,6 +348,38 @@ class Scene:
             part.check(f"scene.boundary.{name}")
         if self.angle_of_repose is not None:
             self.angle_of_repose.check("scene.angle_of_repose")
+        if self.inlet is not None:
+            key, n = "scene.inlet.count", self.inlet.count
+            require(n <= self.grains.count, key, n, f"at most scene.grains.count = {self.grains.count}", "lower it")
+        for name, values in self.vary.items():
+            require(name in PARAMETERS, f"scene.vary.{name}", "not a parameter", " or ".join(PARAMETERS), "pick one")
+            require(bool(values), f"scene.vary.{name}", values, "a list of values", "e.g. [0.3, 0.5, 0.7]")
+            for case in range(len(values)):
+                self._with({name: values[case]})
+
+    def of_case(self, case: int) -> "Scene":
+        """The scene of case number `case`: parameters that vary have that case's values.
+
+        Raises:
+            ConfigError: for a value out of range.
+        """
+        return self._with({name: values[case % len(values)] for name, values in self.vary.items()})
+
+    def _with(self, values: dict[str, float]) -> "Scene":
+        ours = {name: value for name, value in values.items() if name == "damping"}
+        material = {name: value for name, value in values.items() if name not in ours}
+        grains = replace(self.grains, material=replace(self.grains.material, **material))
+        changed = copy(self)  # not `replace`, whose checks would come back here
+        changed.grains, changed.damping = grains, ours.get("damping", self.damping)
+        require(
+            0 <= changed.damping < 1, "scene.vary.damping", changed.damping, "at least 0 and below 1", "see damping"
+        )
+        return changed
+
+    @property
+    def parameters(self) -> dict[str, float]:
+        """The value of every one of PARAMETERS."""
+        return {name: getattr(self if name == "damping" else self.grains.material, name) for name in PARAMETERS}
 
     @staticmethod
     def from_config(values: Any) -> "Scene":

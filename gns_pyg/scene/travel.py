@@ -1,0 +1,66 @@
+"""How far a moving boundary part has come. Runs in Yade's Python too: the standard library only.
+
+Functions of time are arithmetic in `t` with the functions in FUNCTIONS; nothing else is read, so that a scene file
+cannot run code. They are analytic, which makes the speed exact too (see `scene.motion`).
+"""
+
+import ast
+import operator
+from typing import Any
+
+FUNCTIONS = ("sin", "cos", "tan", "tanh", "exp", "sqrt")
+FUNCTION = f"arithmetic (+ - * / **) in t with numbers, pi and {', '.join(FUNCTIONS)}"
+OPERATORS: dict[type, Any] = {
+    ast.Add: operator.add,
+    ast.Sub: operator.sub,
+    ast.Mult: operator.mul,
+    ast.Div: operator.truediv,
+    ast.Pow: operator.pow,
+    ast.USub: operator.neg,
+    ast.UAdd: operator.pos,
+}
+LONGEST = 200  # characters of a function
+
+
+def travel(motion: Any, t: Any, library: Any) -> Any:
+    """The angle, rad, of a rotation, or the way, m, of a translation or oscillation, at time `t`, s.
+
+    Args:
+        motion: a `scene.Motion`, or anything with its attributes.
+        t: what `library` computes with: a float, an array, a tensor (complex ones too).
+        library: the module that has sin, cos, ...: math, numpy or torch.
+
+    Raises:
+        ValueError: for a function that is more than FUNCTION says.
+    """
+    if motion.function is not None:
+        return _evaluate(motion.function, t, library)
+    if motion.kind == "oscillation":
+        return motion.amplitude_m * library.sin(2 * 3.141592653589793 * motion.frequency_hz * t)
+    return (motion.rate_rad_s if motion.kind == "rotation" else motion.speed_m_s) * t
+
+
+def _evaluate(text: str, t: Any, library: Any) -> Any:
+    if len(text) > LONGEST:
+        raise ValueError(f"{len(text)} characters, at most {LONGEST}")
+    try:
+        tree = ast.parse(text, mode="eval")
+    except SyntaxError as error:
+        raise ValueError(error.msg) from None
+    return _value(tree.body, {"t": t, "pi": 3.141592653589793}, library)
+
+
+def _value(node: ast.AST, names: dict[str, Any], library: Any) -> Any:
+    if isinstance(node, ast.Constant) and type(node.value) in (int, float):
+        return float(node.value)
+    if isinstance(node, ast.Name) and node.id in names:
+        return names[node.id]
+    if isinstance(node, ast.UnaryOp) and type(node.op) in OPERATORS:
+        return OPERATORS[type(node.op)](_value(node.operand, names, library))
+    if isinstance(node, ast.BinOp) and type(node.op) in OPERATORS:
+        left, right = (_value(side, names, library) for side in (node.left, node.right))
+        return OPERATORS[type(node.op)](left, right)
+    if isinstance(node, ast.Call) and isinstance(node.func, ast.Name) and node.func.id in FUNCTIONS:
+        if len(node.args) == 1 and not node.keywords:
+            return getattr(library, node.func.id)(_value(node.args[0], names, library))
+    raise ValueError(f"cannot read {ast.unparse(node)}")
