@@ -12,6 +12,7 @@ from gns_pyg.errors import ConfigError
 from gns_pyg.scene.containment import outside
 from gns_pyg.scene.mesh import build_mesh
 from gns_pyg.scene.scene import Scene
+from gns_pyg.scene.symmetry import up_direction
 
 CELL_DIAMETERS = 1.5  # edge of the surface's cells; 1 to 2 read the same angle, 1.5 with the least scatter
 BED_GAP_DIAMETERS = 1.25  # grains nearer than this belong together: the paper's cutoff, 2.5 radii
@@ -29,13 +30,6 @@ def center_of_mass(pos: np.ndarray, mass: np.ndarray) -> np.ndarray:
         (n_frames, 3), m.
     """
     return np.einsum("fgi,g->fi", pos, mass) / mass.sum()
-
-
-def up_direction(scene: Scene) -> np.ndarray:
-    """Unit vector against gravity, (3,); +z where there is no gravity."""
-    gravity = np.asarray(scene.gravity_m_s2, np.float64)
-    strength = np.linalg.norm(gravity)
-    return -gravity / strength if strength > 0 else np.array([0.0, 0.0, 1.0])
 
 
 # ---------------------------------------------------------------------------------------------- angle of repose

@@ -17,10 +17,11 @@ from matplotlib.lines import Line2D
 from trimesh import Trimesh
 
 from gns_pyg.evaluation.metrics import CaseEvaluation, Evaluation, Observables
-from gns_pyg.evaluation.observables import finite_difference_velocity, up_direction
+from gns_pyg.evaluation.observables import finite_difference_velocity
 from gns_pyg.scene.mesh import build_mesh
 from gns_pyg.scene.motion import to_world
 from gns_pyg.scene.scene import Scene
+from gns_pyg.scene.symmetry import up_direction
 
 Style = Literal["-", "--", ":"]
 

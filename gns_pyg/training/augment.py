@@ -1,0 +1,26 @@
+"""Training windows in other poses that the scene cannot tell apart."""
+
+from dataclasses import replace
+
+import torch
+
+from gns_pyg.scene.symmetry import Symmetry
+from gns_pyg.state import Window
+
+
+def transform(window: Window, symmetry: Symmetry, generator: torch.Generator) -> Window:
+    """A copy of `window` with every graph mapped by its own random element of the scene's symmetry.
+
+    Angular velocity is an axial vector: a reflection turns it the other way than a velocity.
+    """
+    if symmetry.trivial:
+        return window
+    drawn = symmetry.draw(len(window.time_s), generator).to(window.pos)
+    center = torch.tensor(symmetry.center_m, dtype=torch.float64).to(window.pos)
+    q, hand = drawn[window.batch], torch.linalg.det(drawn)[window.batch, None]
+    return replace(
+        window,
+        pos=torch.einsum("gij,fgj->fgi", q, window.pos - center) + center,
+        vel=torch.einsum("gij,fgj->fgi", q, window.vel),
+        ang_vel=hand * torch.einsum("gij,fgj->fgi", q, window.ang_vel),
+    )
