@@ -10,16 +10,18 @@ from typing import Any
 
 from safetensors import SafetensorError
 from safetensors.torch import load_file, save_file
+from torch import nn
 
 from gns_pyg.config import typed
 from gns_pyg.dynamics.model_config import ModelConfig
 from gns_pyg.dynamics.simulator import Simulator
 from gns_pyg.errors import BundleError
 from gns_pyg.models.statistics import Statistics
-from gns_pyg.scene.boundary_points import BoundaryPoints
+from gns_pyg.scene.boundary_points import BoundaryPoints, boundary_points
+from gns_pyg.scene.requirements import Requirements, check_covers
 from gns_pyg.scene.scene import Scene
 
-FORMAT_VERSION = 1
+FORMAT_VERSION = 2
 
 
 def save(folder: str | Path, simulator: Simulator, card: Mapping[str, Any]) -> Path:
@@ -40,6 +42,7 @@ def save(folder: str | Path, simulator: Simulator, card: Mapping[str, Any]) -> P
         "format_version": FORMAT_VERSION,
         "scene": asdict(simulator.scene),
         "model": asdict(simulator.config),
+        "requires": asdict(simulator.requires),
         "statistics": asdict(simulator.statistics),
         "card": dict(card),
     }
@@ -71,27 +74,38 @@ def describe(folder: str | Path) -> dict[str, Any]:
     return description
 
 
-def load(folder: str | Path) -> Simulator:
+def load(folder: str | Path, scene: Scene | None = None) -> Simulator:
     """Rebuilds the simulator of a bundle, in evaluation mode, on the CPU.
+
+    Args:
+        folder: the bundle.
+        scene: another scene to simulate with the same networks (other gravity, motion, boundary, ...); the bundle's
+            own when None.
 
     Raises:
         BundleError: if a file is missing or damaged, the format version differs, or weights do not fit the model.
+        ConfigError: if the other scene needs something that the model does not have.
     """
     folder, description = Path(folder), describe(folder)
-    scene = Scene.from_config(description.get("scene"))
+    own = Scene.from_config(description.get("scene"))
+    requires = typed(Requirements, description.get("requires"), "requires")
+    model = typed(ModelConfig, description.get("model"), "model")
     path = folder / "weights.safetensors"
     try:
         weights = load_file(path)
-        points = {
-            name: BoundaryPoints(*(weights[f"boundary.parts.{part}.{key}"].numpy() for key in ("pos", "normal")))
-            for part, name in enumerate(scene.boundary)
-        }
-        simulator = Simulator(
-            scene,
-            typed(ModelConfig, description.get("model"), "model"),
-            points,
-            typed(Statistics, description.get("statistics"), "statistics"),
-        )
+        if scene is None:
+            points = {
+                name: BoundaryPoints(*(weights[f"boundary.parts.{part}.{key}"].numpy() for key in ("pos", "normal")))
+                for part, name in enumerate(own.boundary)
+            }
+        else:
+            check_covers(requires, scene)
+            points = boundary_points(scene, model.cutoff_wall_radii)
+            weights = {key: value for key, value in weights.items() if not key.startswith("boundary.")}
+        statistics = typed(Statistics, description.get("statistics"), "statistics")
+        simulator = Simulator(scene or own, model, requires, points, statistics)
+        if scene is not None:
+            weights |= {f"boundary.{k}": v for k, v in (simulator.boundary or nn.Module()).state_dict().items()}
         simulator.load_state_dict(weights)
     except (OSError, SafetensorError, KeyError, RuntimeError) as error:
         raise BundleError(

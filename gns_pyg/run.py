@@ -18,6 +18,7 @@ from pytorch_lightning.utilities.exceptions import MisconfigurationException
 
 from gns_pyg import bundle, machine
 from gns_pyg.config import check_keys, flat, plain, require, typed
+from gns_pyg.data.coverage import coverage, outside_coverage, values
 from gns_pyg.data.datamodule import DataConfig, DataModule, Split, open_case, open_cases, split
 from gns_pyg.data.statistics import measure
 from gns_pyg.data.trajectory import Trajectory
@@ -32,13 +33,13 @@ from gns_pyg.evaluation.predict import start_frame, write_rollout
 from gns_pyg.report.page import write_page
 from gns_pyg.report.plots import write_plots
 from gns_pyg.report.table import metrics_table
-from gns_pyg.scene.boundary_points import check_density, sample_boundary_points
-from gns_pyg.scene.mesh import build_mesh
+from gns_pyg.scene.boundary_points import boundary_points
+from gns_pyg.scene.requirements import Requirements, Requires, resolve
 from gns_pyg.scene.scene import Scene
 from gns_pyg.training.config import TrainingConfig
 from gns_pyg.training.module import TrainingModule
 
-GROUPS = ["scene", "model", "data", "training", "trainer", "callbacks", "logger"]
+GROUPS = ["scene", "model", "requires", "data", "training", "trainer", "callbacks", "logger"]
 TRAIN_KEYS = ["name", "start_s", "ckpt_path", "device", "folder", *GROUPS]
 log = logging.getLogger(__name__)
 
@@ -55,7 +56,10 @@ def train(cfg: DictConfig) -> dict[str, Any]:
     training = typed(TrainingConfig, cfg.training, "training")
     model = typed(ModelConfig, cfg.model, "model")
     data = typed(DataConfig, cfg.data, "data")
+    forced = typed(Requires, cfg.requires, "requires")
     cases = split(scene, data)
+    requires = resolve(scene, values(cases.train), forced)
+    log.info("what the scene requires (requires.<row> forces one):\n%s", requires)
     for case in (*cases.val, *cases.test):
         start_frame(case, cfg.start_s)
     datamodule = DataModule(
@@ -68,10 +72,11 @@ def train(cfg: DictConfig) -> dict[str, Any]:
     log.info(
         "%s: %d cases to train on, %d for validation, %d unseen", scene.name, *(len(c) for c in vars(cases).values())
     )
-    simulator = build(scene, model, cases, training.seed)
+    simulator = build(scene, model, requires, cases, training.seed)
     log.info("model: %d parameters", sum(p.numel() for p in simulator.parameters()))
     used = cases.describe()
     identity = flat({"model": asdict(model), "training": asdict(training), "cases": used})
+    identity |= {f"requires.{row}": value for row, value in asdict(requires).items() if row != "reasons"}
     del identity["training.updates"]  # a run may be lengthened
     module = TrainingModule(simulator, training, identity)
     trainer = build_trainer(cfg, training, where)
@@ -80,6 +85,7 @@ def train(cfg: DictConfig) -> dict[str, Any]:
     trained = module.judged.eval().to(where)
     expected = climatology(cases.train, scene)
     card = {"cases": used, "training": plain(cfg.training), "climatology": asdict(expected)}
+    card["coverage"] = coverage(scene, cases.train)
     bundle.save(folder / "bundle", trained, strict(card))
     metrics = report(trained, cases.test, expected, cfg, {"bundle": folder / "bundle"})
     bundle.save(folder / "bundle", trained, strict(card | {"metrics": metrics}))
@@ -87,35 +93,44 @@ def train(cfg: DictConfig) -> dict[str, Any]:
 
 
 def evaluate(cfg: DictConfig) -> dict[str, Any]:
-    """Judges a bundle on the cases of its scene (or of data.dir) that it was not trained or validated on."""
+    """Judges a bundle on the cases of its scene (or of data.dir) that it was not trained or validated on.
+
+    With `scene` that scene's cases are taken and simulated instead: transfer without training.
+    """
     simulator, card = load_bundle(cfg), bundle.describe(cfg.bundle)["card"]
     seen = {digest for purpose in ("train", "val") for digest in card["cases"][purpose].values()}
     cases = [case for case in open_cases(simulator.scene, cfg.data.dir) if case.content_hash() not in seen]
+    for case in cases:
+        warn_outside(simulator.scene, case, start_frame(case, cfg.start_s), card)
     return report(simulator, cases, Climatology.from_plain(card["climatology"]), cfg, {})
 
 
 def rollout(cfg: DictConfig) -> dict[str, Any]:
     """Rolls a bundle out from a recorded case and writes the trajectory in the data's own format."""
-    simulator = load_bundle(cfg)
+    simulator, card = load_bundle(cfg), bundle.describe(cfg.bundle)["card"]
     require(cfg.trajectory is not None, "trajectory", "null", "a case file", "e.g. trajectory=data/hopper/case_016.h5")
     trajectory = open_case(cfg.trajectory, simulator.scene)
-    path = Path(cfg.folder) / "rollout.h5"
-    seconds = write_rollout(simulator, trajectory, start_frame(trajectory, cfg.start_s), path)
+    path, start = Path(cfg.folder) / "rollout.h5", start_frame(trajectory, cfg.start_s)
+    warn_outside(simulator.scene, trajectory, start, card)
+    seconds = write_rollout(simulator, trajectory, start, path)
     log.info("%.3g s per simulated second -> %s", seconds, path)
     return {"rollout": str(path), "speed/seconds_per_simulated_second": seconds}
 
 
-def build(scene: Scene, config: ModelConfig, cases: Split, seed: int) -> Simulator:
+def warn_outside(scene: Scene, case: Trajectory, start: int, card: dict[str, Any]) -> None:
+    """Warns of everything about a case and its start that the bundle's training cases did not cover."""
+    now = coverage(scene, [case], slice(start, start + 1))
+    for text in outside_coverage(card["coverage"], now):
+        log.warning("%s: outside what the bundle was trained on: %s", case.path.name, text)
+
+
+def build(scene: Scene, config: ModelConfig, requires: Requirements, cases: Split, seed: int) -> Simulator:
     """A new simulator for a scene, its scales measured on the training cases, its weights drawn from `seed`."""
-    statistics = measure(cases.train, Integrator(scene, config.state, residual=config.residual))
-    points = {}
-    for name, part in scene.boundary.items():
-        mesh, radius_m = build_mesh(name, part), scene.grains.radius_m
-        points[name] = sample_boundary_points(mesh, part.points, scene.seed)
-        check_density(name, points[name], mesh, config.cutoff_wall_radii * radius_m, radius_m)
+    statistics = measure(cases.train, Integrator(scene, requires.state, free_flight=requires.free_flight))
+    points = boundary_points(scene, config.cutoff_wall_radii)
     with torch.random.fork_rng():
         torch.manual_seed(seed)
-        return Simulator(scene, config, points, statistics)
+        return Simulator(scene, config, requires, points, statistics)
 
 
 def build_trainer(cfg: DictConfig, training: TrainingConfig, where: torch.device) -> pl.Trainer:
@@ -149,7 +164,9 @@ def build_trainer(cfg: DictConfig, training: TrainingConfig, where: torch.device
             "correct or remove the key",
         ) from None
     for logger in trainer.loggers:
-        logger.log_hyperparams(flat({key: plain(cfg[key]) for key in ("scene", "model", "training", "data")}))
+        logger.log_hyperparams(
+            flat({key: plain(cfg[key]) for key in ("scene", "model", "requires", "training", "data")})
+        )
     return trainer
 
 
@@ -162,11 +179,12 @@ def fit(trainer: pl.Trainer, module: TrainingModule, datamodule: DataModule, ckp
 
 
 def load_bundle(cfg: DictConfig) -> Simulator:
-    """The bundle that `bundle=PATH` names."""
+    """The bundle that `bundle=PATH` names, for the scene that `scene` names if there is one."""
     require(
         cfg.bundle is not None, "bundle", "null", "a bundle folder", "bundle=runs/.../bundle, as train.py prints it"
     )
-    return bundle.load(cfg.bundle).to(device(cfg))
+    scene = Scene.from_config(cfg.scene) if cfg.get("scene") else None
+    return bundle.load(cfg.bundle, scene).to(device(cfg))
 
 
 def device(cfg: DictConfig) -> torch.device:

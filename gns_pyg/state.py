@@ -22,7 +22,7 @@ class Record:
         moved = {
             f.name: value.to(device, non_blocking=non_blocking)
             for f in fields(self)  # type: ignore[arg-type]
-            if isinstance(value := getattr(self, f.name), Tensor)
+            if isinstance(value := getattr(self, f.name), Tensor | Record)
         }
         return replace(self, **moved)  # type: ignore[type-var]
 
@@ -112,27 +112,36 @@ class Window(Record):
 
 @dataclass(frozen=True)
 class Walls(Record):
-    """Boundary points of every graph at its time, world frame; graph g owns rows [g * n, (g + 1) * n).
+    """Boundary points of one or more graphs at their times, in the world.
 
     Attributes:
         pos: boundary points, m, float64.
         normal: unit normals that point to the grains' side.
         vel: velocity of the wall at the point, m/s.
+        friction_angle: of the wall at the point, rad.
     """
 
     pos: Float[Tensor, "n_points 3"]
     normal: Float[Tensor, "n_points 3"]
     vel: Float[Tensor, "n_points 3"]
+    friction_angle: Float[Tensor, " n_points"]
+
+    @staticmethod
+    def join(walls: "list[Walls]") -> "Walls":
+        """All points, part after part."""
+        return Walls(*(torch.cat([getattr(part, f.name) for part in walls]) for f in fields(Walls)))
 
 
 @dataclass(frozen=True)
 class Graph(Record):
-    """Who can touch whom within the cutoff.
+    """Who can touch whom.
 
     Attributes:
         grain_edges: [sender grain, receiver grain]; both directions of every pair.
-        wall_edges: [boundary point (row of Walls), receiver grain]; walls only send.
+        wall_edges: [boundary point (row of `walls`), receiver grain]; walls only send.
+        walls: the boundary points, or None where the scene has no boundary.
     """
 
     grain_edges: Int[Tensor, "2 n_grain_edges"]
     wall_edges: Int[Tensor, "2 n_wall_edges"]
+    walls: Walls | None = None

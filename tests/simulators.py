@@ -10,12 +10,11 @@ from gns_pyg.dynamics.simulator import Simulator
 from gns_pyg.models.statistics import Statistics
 from gns_pyg.scene.boundary_points import sample_boundary_points
 from gns_pyg.scene.mesh import build_mesh
+from gns_pyg.scene.requirements import Requires, resolve
 from gns_pyg.scene.scene import Scene
 from gns_pyg.state import State
 
 MODEL: dict[str, Any] = {
-    "state": "full",
-    "residual": True,
     "absolute_position": False,
     "contact_features": True,
     "self_loops": False,
@@ -28,25 +27,40 @@ MODEL: dict[str, Any] = {
 }
 PAPER = {
     "state": "differences",
-    "residual": False,
+    "free_flight": False,
+    "free_grains": False,
     "absolute_position": True,
     "contact_features": False,
     "self_loops": True,
     "skip": False,
 }
-STATISTICS = dict(velocity_m_s=0.5, spin_rad_s=20.0, position_mean_m=[0.0, 0.0, 0.1], position_std_m=0.1)
+STATISTICS = dict(
+    velocity_m_s=0.5,
+    spin_rad_s=20.0,
+    position_mean_m=[0.0, 0.0, 0.1],
+    position_std_m=0.1,
+    parameters_mean=[1000.0, 1e6, 0.25, 0.5, 0.1],
+    parameters_std=[1.0, 1.0, 1.0, 0.2, 1.0],
+)
 
 
-def simulator(scene: Scene, seed: int = 0, dtype: torch.dtype = torch.float32, **changes: Any) -> Simulator:
-    """An untrained simulator of `scene`; `changes` replace keys of MODEL. In float64 every weight is float64."""
+def simulator(
+    scene: Scene, seed: int = 0, dtype: torch.dtype = torch.float32, varying: Any = None, **changes: Any
+) -> Simulator:
+    """An untrained simulator of `scene`; `changes` replace keys of MODEL or force rows of what the scene requires.
+
+    In float64 every weight is float64. `varying` holds the parameters' values over the cases.
+    """
+    forced = {row: changes.pop(row) for row in list(changes) if row in Requires.__dataclass_fields__}
     config = ModelConfig(**(MODEL | changes))
-    groups = 1 + ("differences", "velocity", "full").index(config.state)
+    requires = resolve(scene, varying or {}, Requires(**forced))
+    groups = 1 + ("differences", "velocity", "full").index(requires.state)
     statistics = Statistics(**STATISTICS, correction=[0.1, 0.2, 10.0][:groups])
     points = {
         name: sample_boundary_points(build_mesh(name, part), part.points) for name, part in scene.boundary.items()
     }
     torch.manual_seed(seed)
-    return Simulator(scene, config, points, statistics).to(dtype).eval()
+    return Simulator(scene, config, requires, points, statistics).to(dtype).eval()
 
 
 def state_in_box(n_per_graph: list[int], seed: int = 0, half_m: float = 0.06, spin: bool = True) -> State:

@@ -2,7 +2,7 @@
 
 import math
 import os
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
@@ -14,7 +14,7 @@ from torch.utils.data import DataLoader
 from gns_pyg.config import flat, require
 from gns_pyg.data.trajectory import Trajectory
 from gns_pyg.data.windows import UpdateSampler, Windows
-from gns_pyg.errors import DataError
+from gns_pyg.errors import ConfigError, DataError
 from gns_pyg.scene.containment import outside
 from gns_pyg.scene.mesh import build_mesh, require_closed, same_mesh
 from gns_pyg.scene.scene import Scene
@@ -129,7 +129,13 @@ def check_same_scene(trajectory: Trajectory, scene: Scene) -> None:
     Raises:
         DataError: if they differ; names every difference.
     """
-    ours, theirs = _physics(asdict(scene)), _physics(trajectory.scene)
+    try:
+        stored = Scene.from_config(trajectory.scene)  # keys that are newer than the file have their defaults
+    except ConfigError as error:
+        raise DataError(
+            trajectory.path, f"a stored scene that cannot be read: {error}", "a scene", "generate the case again"
+        ) from None
+    ours, theirs = _physics(scene, scene.vary), _physics(stored, scene.vary)
     different = [
         f"{key} = {theirs.get(key)!r} (scene: {ours.get(key)!r})"
         for key in sorted(ours | theirs)
@@ -168,15 +174,20 @@ def check_inside(trajectory: Trajectory, scene: Scene) -> None:
 def _held_otherwise(trajectory: Trajectory, scene: Scene) -> list[str]:
     """What a case holds that `scene` does not describe, whatever the case says of itself."""
     wrong: list[str] = []
-    dt_s, radius_m, count = scene.frame_dt_s, scene.grains.radius_m, scene.grains.count
+    dt_s, radii_m, count = scene.frame_dt_s, np.array(scene.grains.radii_m), scene.grains.count
     times_s = trajectory.times_s - trajectory.times_s[0]
     off_s = np.abs(times_s - dt_s * np.arange(trajectory.n_frames))
     if (off_s > 1e-6 * dt_s).any():
         frame = int((off_s > 1e-6 * dt_s).argmax())
         wrong.append(f"frame {frame} is {times_s[frame]:g} s after the first (scene: {frame * dt_s:g} s)")
-    if (odd := np.abs(trajectory.radius / radius_m - 1) > 1e-9).any():
+    if (odd := np.abs(trajectory.radius[:, None] / radii_m - 1).min(axis=1) > 1e-9).any():
         grain = int(odd.argmax())
-        wrong.append(f"grain {grain} has a radius of {trajectory.radius[grain]:.9g} m (scene: {radius_m} m)")
+        listed = " or ".join(f"{radius_m:g} m" for radius_m in radii_m)
+        wrong.append(f"grain {grain} has a radius of {trajectory.radius[grain]:.9g} m (scene: {listed})")
+    if trajectory.has_active != (passing := scene.outlet is not None or scene.inlet is not None):
+        wrong.append(
+            f"{'no ' if passing else ''}record of who is there (scene: {'an' if passing else 'no'} outlet or inlet)"
+        )
     if trajectory.n_grains != count:
         wrong.append(f"{trajectory.n_grains} grains stored (scene: {count})")
     stored = trajectory.boundary
@@ -188,12 +199,12 @@ def _held_otherwise(trajectory: Trajectory, scene: Scene) -> list[str]:
     return wrong
 
 
-def _physics(scene: Mapping[str, Any]) -> dict[str, Any]:
-    """The part of a scene that decides how grains move, flattened to dotted keys."""
-    decisive = ("gravity_m_s2", "damping", "damping_on_gravity", "frame_dt_s", "grains", "boundary")
-    return {
-        key: v for key, v in flat({k: scene[k] for k in decisive if k in scene}).items() if not key.endswith(".points")
-    }
+def _physics(scene: Scene, varying: Iterable[str]) -> dict[str, Any]:
+    """The part of a scene that decides how grains move in all its cases, flattened to dotted keys."""
+    decisive = ("gravity_m_s2", "damping", "damping_on_gravity", "frame_dt_s", "grains", "boundary", "outlet", "inlet")
+    free = {name if name == "damping" else f"grains.material.{name}" for name in varying}
+    leaves = flat({key: value for key, value in asdict(scene).items() if key in decisive})
+    return {key: value for key, value in leaves.items() if not key.endswith(".points") and key not in free}
 
 
 class DataModule(pl.LightningDataModule):

@@ -6,7 +6,7 @@ import numpy as np
 import torch
 
 from gns_pyg.data.trajectory import Trajectory
-from gns_pyg.data.windows import read_window
+from gns_pyg.data.windows import parameters, read_window
 from gns_pyg.dynamics.integrator import Integrator
 from gns_pyg.models.statistics import Statistics
 
@@ -16,13 +16,18 @@ FRAMES_PER_CASE = 50
 def measure(trajectories: Sequence[Trajectory], integrator: Integrator) -> Statistics:
     """Root mean squares over frames spread evenly over the training cases (see `Statistics`)."""
     velocity, spin, position, corrections = [], [], [], []
+    values = np.array([parameters(trajectory) for trajectory in trajectories])
     for trajectory in trajectories:
         last = trajectory.n_frames - 3
         for start in np.unique(np.linspace(0, max(last, 0), FRAMES_PER_CASE).astype(int)):
             window = read_window(trajectory, int(start), 3)
-            state, following = integrator.read(window, 1), integrator.read(window, 2)
+            there = np.logical_and.reduce(trajectory.active(int(start) + 1, int(start) + 3))
+            if not there.any():
+                continue
+            grains = torch.from_numpy(there)
+            state, following = (integrator.read(window, frame).pick(grains) for frame in (1, 2))
             velocity.append(state.vel.square().mean())
-            spin.append(window.ang_vel[1].square().mean())
+            spin.append(window.ang_vel[1, grains].square().mean())
             position.append(state.pos)
             groups = integrator.target(state, following).split(3, dim=1)
             corrections.append(torch.stack([group.square().mean() for group in groups]))
@@ -33,7 +38,13 @@ def measure(trajectories: Sequence[Trajectory], integrator: Integrator) -> Stati
         correction=torch.stack(corrections).mean(0).sqrt().tolist(),
         position_mean_m=everywhere.mean(0).tolist(),
         position_std_m=float((everywhere - everywhere.mean(0)).square().mean().sqrt()),
+        parameters_mean=values.mean(axis=0).tolist(),
+        parameters_std=[std if std > 1e-9 * abs(mean) else 1.0 for std, mean in zip(*_moments(values), strict=True)],
     )
+
+
+def _moments(values: np.ndarray) -> tuple[list[float], list[float]]:
+    return values.std(axis=0).tolist(), values.mean(axis=0).tolist()
 
 
 def _root(squares: list[torch.Tensor]) -> float:

@@ -8,6 +8,7 @@ from torch.utils.data import Dataset, Sampler
 
 from gns_pyg.data.trajectory import Trajectory
 from gns_pyg.errors import DataError
+from gns_pyg.scene.scene import PARAMETERS
 from gns_pyg.state import Window
 
 
@@ -22,7 +23,15 @@ def read_window(trajectory: Trajectory, start: int, length: int) -> Window:
         radius=torch.from_numpy(trajectory.radius),
         time_s=torch.tensor([trajectory.times_s[start]], dtype=torch.float64),
         batch=torch.zeros(trajectory.n_grains, dtype=torch.long),
+        parameters=torch.tensor([parameters(trajectory)], dtype=torch.float64),
+        active=torch.from_numpy(trajectory.active(start, start + length)) if trajectory.has_active else None,
     )
+
+
+def parameters(trajectory: Trajectory) -> list[float]:
+    """The values of `scene.PARAMETERS` that a case was made with."""
+    values = {**trajectory.scene["grains"]["material"], "damping": trajectory.scene["damping"]}
+    return [float(values[name]) for name in PARAMETERS]
 
 
 class Windows(Dataset):

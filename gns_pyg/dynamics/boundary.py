@@ -1,4 +1,4 @@
-"""The boundary points of a scene: where they are at a time, and which of them a grain can reach."""
+"""The boundary points of a scene: which of them a grain can reach, and where those are."""
 
 from collections.abc import Callable, Iterable, Iterator, Mapping
 from typing import cast
@@ -10,7 +10,7 @@ from torch import Tensor, nn
 from gns_pyg.graph.neighbors import Index, backend
 from gns_pyg.scene.boundary_points import BoundaryPoints
 from gns_pyg.scene.motion import rotation, to_body, to_world
-from gns_pyg.scene.scene import Motion, Scene
+from gns_pyg.scene.scene import Part, Scene
 from gns_pyg.state import State, Walls
 
 
@@ -20,16 +20,18 @@ class BoundaryPart(nn.Module):
 
     Args:
         points: boundary points at t = 0.
-        motion: the part's rigid motion.
+        part: gives the rigid motion and the friction angle.
         neighbors: search backend (see `graph.neighbors`).
+        static: build the search structure once; else at every search (only to measure what that costs).
     """
 
     pos: Tensor
     normal: Tensor
 
-    def __init__(self, points: BoundaryPoints, motion: Motion, neighbors: str) -> None:
+    def __init__(self, points: BoundaryPoints, part: Part, neighbors: str, *, static: bool) -> None:
         super().__init__()
-        self.motion, self.neighbors = motion, neighbors
+        self.motion, self.friction_angle_rad = part.motion, part.friction_angle_rad
+        self.neighbors, self.static = neighbors, static
         self.register_buffer("pos", torch.as_tensor(points.pos, dtype=torch.float64))
         self.register_buffer("normal", torch.as_tensor(points.normal, dtype=torch.float64))
         self._index: Index | None = None
@@ -41,46 +43,64 @@ class BoundaryPart(nn.Module):
         self.pos, self.normal, self._index = pos.to(self.pos.device), normal.to(self.pos.device), None
         return self
 
-    def at(self, time_s: Float[Tensor, " b"]) -> tuple[Float[Tensor, "b p 3"], ...]:
-        """World positions, normals and velocities of the points at each time."""
-        pos, vel = to_world(self.motion, self.pos, time_s)
-        return pos, self.normal @ rotation(self.motion, time_s).transpose(1, 2), vel
+    def at(self, rows: Int[Tensor, " n"], time_s: Float[Tensor, " n"]) -> Walls:
+        """Points `rows` in the world, each at its own time."""
+        pos, vel = to_world(self.motion, self.pos[rows], time_s)
+        normal = self.normal[rows]
+        if self.motion.moves:
+            normal = torch.einsum("nij,nj->ni", rotation(self.motion, time_s), normal)
+        return Walls(pos, normal, vel, torch.full_like(time_s, self.friction_angle_rad))
 
-    def within(self, state: State, reach_m: float) -> tuple[Int[Tensor, " e"], Int[Tensor, " e"]]:
-        """Every (point, grain) at most `reach_m` apart."""
-        if self._index is None:
+    def within(self, state: State, reach_m: Float[Tensor, " n_grains"]) -> tuple[Int[Tensor, " e"], Int[Tensor, " e"]]:
+        """Every (point, grain) at most the grain's reach apart."""
+        if self._index is None or not self.static:
             build = backend(self.neighbors, self.pos.device).build
             self._index = build(self.pos, torch.zeros(len(self.pos), dtype=torch.long, device=self.pos.device))
         body_pos = to_body(self.motion, state.pos.detach(), state.time_s[state.batch])
-        point, grain = self._index(body_pos, torch.zeros_like(state.batch), reach_m)
-        return point, grain
+        farthest = float(reach_m.max()) if len(reach_m) else 0.0
+        point, grain = self._index(body_pos, torch.zeros_like(state.batch), farthest)
+        if (reach_m == farthest).all():
+            return point, grain
+        near = (self.pos[point] - body_pos[grain]).square().sum(1) <= reach_m[grain].square()
+        return point[near], grain[near]
 
 
 class Boundary(nn.Module):
-    """All parts of a scene's boundary; their points are numbered part after part, then graph after graph."""
+    """All parts of a scene's boundary.
 
-    def __init__(self, scene: Scene, points: Mapping[str, BoundaryPoints], neighbors: str) -> None:
+    Args:
+        scene: gives the parts.
+        points: their points.
+        neighbors: search backend.
+        static: see `BoundaryPart`.
+        reachable: only points that a grain reaches are placed in the world; else all of them.
+    """
+
+    def __init__(
+        self, scene: Scene, points: Mapping[str, BoundaryPoints], neighbors: str, *, static: bool, reachable: bool
+    ) -> None:
         super().__init__()
         self.parts = nn.ModuleList(
-            BoundaryPart(points[name], part.motion, neighbors) for name, part in scene.boundary.items()
+            BoundaryPart(points[name], part, neighbors, static=static) for name, part in scene.boundary.items()
         )
-        self.moves = any(part.motion.moves for part in scene.boundary.values())
+        self.reachable = reachable
 
     def __iter__(self) -> Iterator[BoundaryPart]:
         return iter(cast(Iterable[BoundaryPart], self.parts))
 
-    def at(self, time_s: Float[Tensor, " b"]) -> Walls:
-        """The boundary of every graph at its time."""
-        parts = zip(*(part.at(time_s) for part in self), strict=True)
-        return Walls(*(torch.cat(values, dim=1).flatten(0, 1) for values in parts))
-
-    def edges(self, state: State, reach_m: float) -> Int[Tensor, "2 e"]:
-        """[point (row of `at`), grain] for every pair within reach."""
-        found: list[Tensor] = []
-        offset = 0
-        per_graph = sum(len(part.pos) for part in self)
+    def contacts(self, state: State, reach_m: Float[Tensor, " n_grains"]) -> tuple[Walls, Int[Tensor, "2 e"]]:
+        """Boundary points in the world and [point, grain] for every pair within the grain's reach."""
+        found, walls, n_rows = [state.batch.new_empty(2, 0)], [], 0
         for part in self:
             point, grain = part.within(state, reach_m)
-            found.append(torch.stack([point + offset + per_graph * state.batch[grain], grain]))
-            offset += len(part.pos)
-        return torch.cat(found, dim=1)
+            row = state.batch[grain] * len(part.pos) + point  # graph after graph
+            if self.reachable:
+                rows, sender = row.unique(return_inverse=True)
+            else:
+                rows, sender = torch.arange(state.n_graphs * len(part.pos), device=row.device), row
+            graph = rows // len(part.pos)
+            walls.append(part.at(rows - graph * len(part.pos), state.time_s[graph]))
+            found.append(torch.stack([sender + n_rows, grain]))
+            n_rows += len(rows)
+        none = Walls(*(state.pos.new_empty(shape) for shape in ((0, 3), (0, 3), (0, 3), (0,))))
+        return Walls.join([none, *walls]), torch.cat(found, dim=1)

@@ -2,7 +2,7 @@
 
 A correction is what contacts add to what a grain would do without them, in columns of three:
 mean velocity over the step (m/s), then, if the state holds them, end velocity (m/s) and angular velocity (rad/s).
-Without `residual` the first group is the mean velocity itself, as in the paper.
+Without `free_flight` the first group is the mean velocity itself, as in the paper.
 """
 
 from dataclasses import replace
@@ -13,10 +13,9 @@ from torch import Tensor
 
 from gns_pyg.config import require
 from gns_pyg.scene.free_flight import free_flight
-from gns_pyg.scene.scene import Scene
+from gns_pyg.scene.requirements import STATES
+from gns_pyg.scene.scene import PARAMETERS, Scene
 from gns_pyg.state import State, Window
-
-STATES = ("differences", "velocity", "full")
 
 
 class Integrator:
@@ -26,12 +25,12 @@ class Integrator:
         scene: gives the free-flight law and the frame step.
         state: what a state holds. `differences`: position and (x(t) - x(t - dt)) / dt, as in the paper; `velocity`:
             position and instantaneous velocity; `full`: angular velocity too.
-        residual: corrections are taken relative to free flight; else relative to standing still.
+        free_flight: corrections are taken relative to free flight; else relative to standing still.
     """
 
-    def __init__(self, scene: Scene, state: str, *, residual: bool) -> None:
-        require(state in STATES, "model.state", state, " or ".join(STATES), "pick one of them")
-        self.scene, self.state, self.residual = scene, state, residual
+    def __init__(self, scene: Scene, state: str, *, free_flight: bool) -> None:
+        require(state in STATES, "requires.state", state, " or ".join(STATES), "pick one of them")
+        self.scene, self.state, self.free_flight = scene, state, free_flight
         self.dt_s = scene.frame_dt_s
         self.n_groups = 1 + STATES.index(state)
 
@@ -48,15 +47,20 @@ class Integrator:
             radius=window.radius,
             time_s=window.time_s + frame * self.dt_s,
             batch=window.batch,
+            parameters=window.parameters,
+            active=None if window.active is None else window.active[frame],
         )
 
     def without_contact(self, state: State) -> State:
-        """Where the state would be one frame later if nothing touched (`residual`), or if it stood still."""
+        """Where the state would be one frame later if nothing touched (`free_flight`), or if it stood still."""
         later = state.time_s + self.dt_s
-        if not self.residual:
+        if not self.free_flight:
             still = torch.zeros_like(state.vel)
             return replace(state, vel=still, ang_vel=None if state.ang_vel is None else still, time_s=later)
-        pos, vel = free_flight(state.pos, state.vel, self.scene, self.dt_s)
+        damping = None
+        if state.parameters is not None:
+            damping = state.parameters[state.batch, PARAMETERS.index("damping")]
+        pos, vel = free_flight(state.pos, state.vel, self.scene, self.dt_s, damping)
         if self.state == "differences":  # the mean velocity of one frame passes into that of the next
             pos = state.pos + vel * self.dt_s
         return replace(state, pos=pos, vel=vel, time_s=later)

@@ -1,4 +1,4 @@
-"""The choices that make a model; conf/model/*.yaml are its files."""
+"""The choices that make a model, beside what its scene requires; conf/model/*.yaml are its files."""
 
 import math
 from dataclasses import dataclass
@@ -13,19 +13,16 @@ class ModelConfig:
     """Architecture of a simulator.
 
     Attributes:
-        state: `differences`, `velocity` or `full` (see `dynamics.integrator`).
-        residual: predict the difference to the scene's free flight; else the velocity itself (the paper).
         absolute_position: give networks the absolute position (the paper; breaks translation invariance).
         contact_features: gap, approach and slip on edges, beside the geometry of Mayr et al.
         self_loops: an edge from every grain to itself, so that one without neighbours is computed too (the paper).
         skip: skip connections and layer norms (not in the paper).
         hidden, layers, mlp_layers: width, rounds of message passing, linear layers of each MLP.
-        cutoff_grain_radii, cutoff_wall_radii: reach of the two searches, in grain radii.
+        cutoff_grain_radii: two grains see each other within this many times the mean of their radii.
+        cutoff_wall_radii: a grain sees boundary points within this many of its radii.
         neighbors: search backend, or `auto`.
     """
 
-    state: str = MISSING
-    residual: bool = MISSING
     absolute_position: bool = MISSING
     contact_features: bool = MISSING
     self_loops: bool = MISSING

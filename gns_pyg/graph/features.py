@@ -1,4 +1,4 @@
-"""Node and edge features, dimensionless: lengths over the grain radius, velocities over the training data's scale.
+"""Edge features, dimensionless: lengths over the grain radius (the mean of two), velocities over the data's scale.
 
 Differences are taken in float64 by the caller's positions; callers cast the result to the model's dtype.
 Edge features follow Mayr et al. 2023 (the paper's [17]): relative position, distance, direction and inverse powers of
@@ -21,14 +21,16 @@ def grain_edges(
     """Features of grain-grain edges; `rel_pos` points from receiver to sender."""
     sender, receiver = graph.grain_edges
     rel_pos = state.pos[sender] - state.pos[receiver]
-    radius, touch = state.radius[receiver], state.radius[sender] + state.radius[receiver]
+    touch = state.radius[sender] + state.radius[receiver]
+    radius = touch / 2
     distance, direction = _polar(rel_pos, radius)
     features = _geometry(rel_pos, distance, direction, radius)
     if contact:
         rel_vel = state.vel[sender] - state.vel[receiver]
         slip = rel_vel
         if state.ang_vel is not None:  # surface velocities at the contact: v + w x arm, arms of opposite sign
-            turning = state.radius[sender, None] * state.ang_vel[sender] + radius[:, None] * state.ang_vel[receiver]
+            arm = state.radius[:, None] * state.ang_vel
+            turning = arm[sender] + arm[receiver]
             slip = rel_vel - torch.linalg.cross(turning, direction)
         ahead = torch.linalg.vector_norm(rel_pos + rel_vel * dt_s, dim=1)
         features += _contact(distance - touch, ahead - touch, rel_vel, slip, direction, radius, velocity_m_s, dt_s)
@@ -36,7 +38,7 @@ def grain_edges(
 
 
 def wall_edges(
-    state: State, walls: Walls, graph: Graph, *, velocity_m_s: float, dt_s: float, contact: bool
+    state: State, graph: Graph, walls: Walls, *, velocity_m_s: float, dt_s: float, contact: bool
 ) -> Float[Tensor, "n_wall_edges f"]:
     """Features of edges from boundary points to grains; the gap is that to the point's tangent plane."""
     point, grain = graph.wall_edges

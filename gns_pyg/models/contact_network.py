@@ -18,6 +18,8 @@ class ContactNetwork(nn.Module):
         n_out: outputs per grain.
         hidden, layers, mlp_layers: width, rounds of message passing, linear layers of each MLP.
         skip: skip connections and layer norms (see `Interaction`).
+        sparse: compute only the grains and points that an edge connects; else all of them, with the same result (only
+            to measure what that costs).
     """
 
     def __init__(
@@ -31,9 +33,10 @@ class ContactNetwork(nn.Module):
         layers: int,
         mlp_layers: int,
         skip: bool,
+        sparse: bool = True,
     ) -> None:
         super().__init__()
-        self.n_out = n_out
+        self.n_out, self.sparse = n_out, sparse
 
         def encoder(n_in: int) -> nn.Module:
             return mlp(n_in, hidden, hidden, mlp_layers, layer_norm=skip)
@@ -55,17 +58,21 @@ class ContactNetwork(nn.Module):
         Where senders are the receivers, `sender_features` is None and every sender must also receive
         (edges come in both directions), so that grains without an edge can be left out of the computation.
         """
-        reached, receiver = edge_index[1].unique(return_inverse=True)
-        receivers = self.encode_receiver(receiver_features[reached])
+        reached = edge_index[1].unique()
+        grains = reached if self.sparse else torch.arange(len(receiver_features), device=edge_index.device)
+        receivers, receiver = self.encode_receiver(receiver_features[grains]), torch.searchsorted(grains, edge_index[1])
+        senders = None
         if self.encode_sender is None or sender_features is None:
-            sender = torch.searchsorted(reached, edge_index[0])
-        else:
+            sender = torch.searchsorted(grains, edge_index[0])
+        elif self.sparse:
             reaching, sender = edge_index[0].unique(return_inverse=True)
             senders = self.encode_sender(sender_features[reaching])
+        else:
+            senders, sender = self.encode_sender(sender_features), edge_index[0]
         edges, compact = self.encode_edge(edge_features), torch.stack([sender, receiver])
         for interaction in self.interactions:
-            receivers, edges = interaction(
-                receivers if self.encode_sender is None else senders, receivers, edges, compact
-            )
-        out = receiver_features.new_zeros(receiver_features.shape[0], self.n_out)
-        return out.index_copy(0, reached, self.decode(receivers))
+            receivers, edges = interaction(receivers if senders is None else senders, receivers, edges, compact)
+        effect = self.decode(receivers)
+        if not self.sparse:
+            effect = effect[reached]
+        return receiver_features.new_zeros(len(receiver_features), self.n_out).index_copy(0, reached, effect)

@@ -14,6 +14,7 @@ class Statistics:
         spin_rad_s: of an angular velocity component.
         correction: of each group of targets (see `dynamics.integrator`): m/s, m/s, rad/s.
         position_mean_m, position_std_m: of grain centres; used only by models that see absolute position.
+        parameters_mean, parameters_std: over the cases, in the order of `scene.PARAMETERS`; 1 where none varies.
     """
 
     velocity_m_s: float
@@ -21,6 +22,8 @@ class Statistics:
     correction: list[float]
     position_mean_m: list[float]
     position_std_m: float
+    parameters_mean: list[float]
+    parameters_std: list[float]
 
     def __post_init__(self) -> None:
         for name in ("velocity_m_s", "position_std_m"):

@@ -8,7 +8,11 @@ from gns_pyg.scene.scene import Scene
 
 
 def free_flight(
-    pos: Float[Tensor, "n 3"], vel: Float[Tensor, "n 3"], scene: Scene, dt_s: float
+    pos: Float[Tensor, "n 3"],
+    vel: Float[Tensor, "n 3"],
+    scene: Scene,
+    dt_s: float,
+    damping: Float[Tensor, " n"] | None = None,
 ) -> tuple[Float[Tensor, "n 3"], Float[Tensor, "n 3"]]:
     """Moves free grains by `dt_s`, exactly.
 
@@ -21,13 +25,15 @@ def free_flight(
         vel: instantaneous velocity, m/s.
         scene: gives gravity and damping.
         dt_s: time to move, s.
+        damping: of each grain, where it varies; the scene's when None.
 
     Returns:
         Position and velocity after `dt_s`.
     """
     gravity = torch.tensor(scene.gravity_m_s2, dtype=pos.dtype, device=pos.device)
-    damping = scene.damping if scene.damping_on_gravity else 0.0
-    slowing, speeding = gravity * (1 + damping), gravity * (1 - damping)
+    felt = torch.full_like(pos[:, :1], scene.damping) if damping is None else damping[:, None].to(pos.dtype)
+    felt = felt if scene.damping_on_gravity else torch.zeros_like(felt)
+    slowing, speeding = gravity * (1 + felt), gravity * (1 - felt)
     against = vel * gravity < 0
     until_turn = torch.where(against, -vel / torch.where(slowing == 0, 1.0, slowing), 0.0).clamp(max=dt_s)
     rest = dt_s - until_turn

@@ -12,7 +12,9 @@ from torch.optim.swa_utils import AveragedModel, get_ema_multi_avg_fn
 
 from gns_pyg.dynamics.simulator import Simulator
 from gns_pyg.errors import ConfigError, NumericalError
+from gns_pyg.scene.symmetry import symmetry
 from gns_pyg.state import State, Window
+from gns_pyg.training.augment import transform
 from gns_pyg.training.config import TrainingConfig
 
 
@@ -32,6 +34,7 @@ class TrainingModule(pl.LightningModule):
     def __init__(self, simulator: Simulator, config: TrainingConfig, identity: Mapping[str, Any] | None = None) -> None:
         super().__init__()
         self.simulator, self.config, self.identity = simulator, config, dict(identity or {})
+        self.symmetry = symmetry(simulator.scene)
         self.average: AveragedModel | None = None
         if config.average_decay:
             self.average = AveragedModel(simulator, multi_avg_fn=get_ema_multi_avg_fn(config.average_decay))
@@ -65,13 +68,18 @@ class TrainingModule(pl.LightningModule):
 
     def training_step(self, window: Window, batch_idx: int) -> Tensor:
         random = torch.Generator().manual_seed(self.config.seed * 1_000_003 + self.global_step)
+        if self.simulator.requires.symmetry:
+            window = transform(window, self.symmetry, random)
         state, frame = self.simulator.integrator.read(window, 1), 1
         state = perturb(state, self.config, self.simulator, random)
         with torch.no_grad():
             for _ in range(self._own_steps(random)):
                 state, frame = self.simulator(state), frame + 1
-        target = self.simulator.target(state, self.simulator.integrator.read(window, frame + 1))
-        loss = (self.simulator.correction(state) - target).square().mean()
+        following = self.simulator.integrator.read(window, frame + 1)
+        error = self.simulator.correction(state) - self.simulator.target(state, following)
+        if state.active is not None and following.active is not None:
+            error = error[state.active & following.active]
+        loss = error.square().mean()
         if not torch.isfinite(loss):
             raise NumericalError(
                 f"training update {self.global_step}",

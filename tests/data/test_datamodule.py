@@ -177,7 +177,7 @@ def test_sampler_visits_every_item_once_per_epoch_and_resumes_anywhere():
 
 def test_statistics_are_root_mean_squares(folder):
     cases = split(SCENE, DataConfig(dir=str(folder))).train
-    statistics = measure(cases, Integrator(SCENE, "velocity", residual=False))
+    statistics = measure(cases, Integrator(SCENE, "velocity", free_flight=False))
     assert statistics.velocity_m_s == pytest.approx(np.sqrt(np.mean(cases[0].read("velocity") ** 2)), rel=0.2)
 
 

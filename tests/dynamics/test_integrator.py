@@ -14,10 +14,10 @@ from tests import scenes
 from tests.simulators import state_in_box
 
 
-@pytest.mark.parametrize("residual", [True, False])
+@pytest.mark.parametrize("free_flight", [True, False])
 @pytest.mark.parametrize("kind", STATES)
-def test_target_is_the_inverse_of_integrate(kind, residual):
-    integrator = Integrator(scenes.scene(50, 5, damping=0.2), kind, residual=residual)
+def test_target_is_the_inverse_of_integrate(kind, free_flight):
+    integrator = Integrator(scenes.scene(50, 5, damping=0.2), kind, free_flight=free_flight)
     state = state_in_box([30, 20], spin=kind == "full")
     correction = torch.randn(50, 3 * integrator.n_groups, dtype=torch.float64)
     following = integrator.integrate(state, correction)
@@ -26,7 +26,7 @@ def test_target_is_the_inverse_of_integrate(kind, residual):
 
 
 def test_differences_follow_the_paper_s_equation_11():
-    integrator = Integrator(scenes.scene(10, 5), "differences", residual=False)
+    integrator = Integrator(scenes.scene(10, 5), "differences", free_flight=False)
     state, velocity = state_in_box([10], spin=False), torch.randn(10, 3, dtype=torch.float64)
     following = integrator.integrate(state, velocity)
     assert torch.allclose(following.pos, state.pos + velocity * 0.01)
@@ -57,4 +57,4 @@ def test_damping_that_spares_gravity_leaves_plain_ballistics():
 
 def test_unknown_state_is_refused():
     with pytest.raises(ConfigError, match="differences or velocity or full"):
-        Integrator(scenes.scene(1, 5), "momentum", residual=True)
+        Integrator(scenes.scene(1, 5), "momentum", free_flight=True)

@@ -42,7 +42,7 @@ def states_equal(a, b, **tolerance):
 @pytest.mark.parametrize("motion", [{}, TURNING], ids=["still", "turning"])
 def test_batch_equals_separate(changes, motion):
     model = simulator(boxed(60, **motion), dtype=torch.float64, **changes)
-    together = state_in_box([25, 1, 34], spin=model.config.state == "full")
+    together = state_in_box([25, 1, 34], spin=model.requires.state == "full")
     after = model(together)
     for graph in range(3):
         mine = together.batch == graph
@@ -66,7 +66,7 @@ def pick(state, mine, graph):
 @every_model
 def test_permuting_grains_permutes_the_result(changes):
     model = simulator(boxed(40), dtype=torch.float64, **changes)
-    state = state_in_box([40], spin=model.config.state == "full")
+    state = state_in_box([40], spin=model.requires.state == "full")
     order = torch.randperm(40, generator=torch.Generator().manual_seed(1))
     spin = None if state.ang_vel is None else state.ang_vel[order]
     shuffled = replace(state, pos=state.pos[order], vel=state.vel[order], ang_vel=spin)
@@ -134,8 +134,8 @@ def test_static_walls_are_indexed_once():
 
 def test_turning_walls_are_searched_where_they_are():
     scene = boxed(20, **TURNING)
-    model, state = simulator(scene), state_in_box([12, 8], half_m=0.08)
-    walls, edges = model.boundary.at(state.time_s), model.graph(state).wall_edges
+    model, state = simulator(scene, reachable_points=False, free_grains=False), state_in_box([12, 8], half_m=0.08)
+    walls, edges = model.graph(state).walls, model.graph(state).wall_edges
     n_points = len(walls.pos) // 2
     near = (torch.cdist(walls.pos, state.pos) <= 0.03) & (
         torch.arange(2).repeat_interleave(n_points)[:, None] == state.batch[None]

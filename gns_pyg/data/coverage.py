@@ -1,0 +1,67 @@
+"""What a set of cases covers, and what of a new one lies outside."""
+
+from collections.abc import Mapping, Sequence
+
+import numpy as np
+import torch
+
+from gns_pyg.data.trajectory import Trajectory
+from gns_pyg.data.windows import parameters
+from gns_pyg.scene.mesh import build_mesh
+from gns_pyg.scene.motion import to_world
+from gns_pyg.scene.scene import PARAMETERS, Scene
+
+SPEEDS = ("grain speed, m/s", "angular speed, rad/s", "wall speed, m/s")  # an upper limit counts, with some room
+ROOM = 1.2
+
+
+def values(trajectories: Sequence[Trajectory]) -> dict[str, list[float]]:
+    """Every parameter of `scene.PARAMETERS` -> its values in the cases."""
+    columns = np.array([parameters(trajectory) for trajectory in trajectories]).T
+    return {name: sorted(set(column.tolist())) for name, column in zip(PARAMETERS, columns, strict=True)}
+
+
+def coverage(scene: Scene, trajectories: Sequence[Trajectory], frames: slice = slice(None)) -> dict[str, list[float]]:
+    """[lowest, highest] of everything that a model trained on the cases has seen.
+
+    Args:
+        scene: what they are cases of.
+        trajectories: the cases.
+        frames: frames whose speeds count.
+    """
+    ranges = {name: [found[0], found[-1]] for name, found in values(trajectories).items()}
+    ranges["grain radius, m"] = [scene.grains.radii_m[0], scene.grains.radii_m[-1]]
+    ranges["gravity, m/s^2"] = [float(np.linalg.norm(scene.gravity_m_s2))] * 2
+    ranges["frame, s"] = [scene.frame_dt_s] * 2
+    for name, field in zip(SPEEDS, ("velocity", "angular_velocity"), strict=False):
+        fastest = [np.linalg.norm(t.read(field, frames.start or 0, frames.stop), axis=2).max() for t in trajectories]
+        ranges[name] = [0.0, float(max(fastest))]
+    ranges["wall speed, m/s"] = [0.0, max([0.0, *map(float, _wall_speeds(scene))])]
+    return ranges
+
+
+def outside_coverage(trained: Mapping[str, Sequence[float]], now: Mapping[str, Sequence[float]]) -> list[str]:
+    """One sentence for every range of `now` that leaves that of `trained`."""
+    texts = []
+    for name, (low, high) in now.items():
+        lowest, highest = trained[name]
+        slack = 1e-6 * max(abs(lowest), abs(highest))
+        too_high = high > (ROOM * highest + 1e-9 if name in SPEEDS else highest + slack)
+        if too_high or (name not in SPEEDS and low < lowest - slack):
+            shown = f"{high:.4g}" if too_high else f"{low:.4g}"
+            seen = f"{highest:.4g}" if lowest == highest else f"{lowest:.4g} to {highest:.4g}"
+            texts.append(f"{name}: {shown}; the model has seen {seen}")
+    return texts
+
+
+def _wall_speeds(scene: Scene) -> list[torch.Tensor]:
+    """Highest speed of each moving part's corners at the scene's frames, m/s."""
+    times = scene.frame_dt_s * torch.arange(scene.n_frames, dtype=torch.float64)
+    speeds = []
+    for name, part in scene.boundary.items():
+        if part.motion.moves:
+            corners = torch.from_numpy(np.array(build_mesh(name, part).vertices))
+            for time_s in times:
+                vel = to_world(part.motion, corners, time_s.expand(len(corners)))[1]
+                speeds.append(torch.linalg.vector_norm(vel, dim=1).max())
+    return speeds
