@@ -146,16 +146,22 @@ def _derive(scene: Scene, parameters: Mapping[str, Sequence[float]]) -> dict[str
     own = symmetry(scene)
     return {
         "wall_network": (bool(parts), f"boundary: {', '.join(parts)}" if parts else "no boundary: no wall network"),
-        "wall_velocity": (bool(moving), f"moving: {', '.join(moving)}" if moving else "no part moves"),
-        "wall_friction": (len(frictions) > 1, f"wall friction angles: {sorted(frictions)} rad" if parts else "no wall"),
+        "wall_velocity": (
+            bool(moving),
+            f"moving: {', '.join(moving)}" if moving else "no part moves: no wall-velocity feature",
+        ),
+        "wall_friction": (len(frictions) > 1, f"{len(frictions)} wall friction angles"),
         "static_walls": (True, _search(len(parts), len(moving))),
         "reachable_points": (True, "points and grains out of each other's reach change nothing"),
         "free_flight": (True, f"gravity {scene.gravity_m_s2} m/s^2 with damping {scene.damping} is known, not learned"),
         "free_grains": (True, "grains that can touch nothing within a frame follow it"),
-        "radius_features": (len(radii) > 1, f"{len(radii)} radii" if len(radii) > 1 else "one radius"),
-        "material_features": (varying, "vary between cases" if varying else "one material in all cases"),
+        "radius_features": (
+            len(radii) > 1,
+            f"{len(radii)} radii" if len(radii) > 1 else "one radius: no radius feature",
+        ),
+        "material_features": (varying, "vary between cases" if varying else "one material: no material feature"),
         "symmetry": (not own.trivial, own.describe()),
-        "active_mask": (bool(passing), " and ".join(passing) or "no grain leaves or enters"),
+        "active_mask": (bool(passing), " and ".join(passing) or "no grain leaves or enters: no mask"),
         "state": (scene.state, "as data_gen.restart measured it (docs/state.md)"),
     }
 
