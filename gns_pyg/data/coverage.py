@@ -12,7 +12,7 @@ from gns_pyg.scene.motion import to_world
 from gns_pyg.scene.scene import PARAMETERS, Scene
 
 SPEEDS = ("grain speed, m/s", "angular speed, rad/s", "wall speed, m/s")  # an upper limit counts, with some room
-ROOM = 1.2
+ROOM, SLACK = 1.2, 0.01
 
 
 def values(trajectories: Sequence[Trajectory]) -> dict[str, list[float]]:
@@ -31,7 +31,10 @@ def coverage(scene: Scene, trajectories: Sequence[Trajectory], frames: slice = s
     """
     ranges = {name: [found[0], found[-1]] for name, found in values(trajectories).items()}
     ranges["grain radius, m"] = [scene.grains.radii_m[0], scene.grains.radii_m[-1]]
-    ranges["gravity, m/s^2"] = [float(np.linalg.norm(scene.gravity_m_s2))] * 2
+    strength = float(np.linalg.norm(scene.gravity_m_s2))
+    ranges["gravity, m/s^2"] = [strength] * 2
+    tilt = np.degrees(np.arccos(np.clip(-scene.gravity_m_s2[2] / strength, -1, 1))) if strength else 0.0
+    ranges["angle of gravity to -z, degrees"] = [float(tilt)] * 2
     ranges["frame, s"] = [scene.frame_dt_s] * 2
     for name, field in zip(SPEEDS, ("velocity", "angular_velocity"), strict=False):
         fastest = [np.linalg.norm(t.read(field, frames.start or 0, frames.stop), axis=2).max() for t in trajectories]
@@ -45,7 +48,7 @@ def outside_coverage(trained: Mapping[str, Sequence[float]], now: Mapping[str, S
     texts = []
     for name, (low, high) in now.items():
         lowest, highest = trained[name]
-        slack = 1e-6 * max(abs(lowest), abs(highest))
+        slack = SLACK * max(abs(lowest), abs(highest)) + 1e-9
         too_high = high > (ROOM * highest + 1e-9 if name in SPEEDS else highest + slack)
         if too_high or (name not in SPEEDS and low < lowest - slack):
             shown = f"{high:.4g}" if too_high else f"{low:.4g}"

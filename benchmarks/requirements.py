@@ -1,0 +1,164 @@
+"""What leaving out saves, per scene and row: `python benchmarks/requirements.py [scene ...]`.
+
+Steps an untrained simulator of the default size from recorded states of each scene, once as the scene requires it
+("with" the row) and once with that row forced the other way ("without"), side by side, on one thread, and writes
+benchmarks/results/requirements.json. Grains that fly free are compared with Yade's next frame too.
+"""
+
+import json
+import sys
+import time
+from dataclasses import replace
+from pathlib import Path
+from statistics import median
+from typing import Any
+
+import torch
+from hydra import compose, initialize_config_dir
+
+from gns_pyg import run
+from gns_pyg.config import CONF, typed
+from gns_pyg.data.coverage import values
+from gns_pyg.data.datamodule import Split, find_cases, open_case
+from gns_pyg.data.trajectory import Trajectory
+from gns_pyg.data.windows import read_window
+from gns_pyg.dynamics.model_config import ModelConfig
+from gns_pyg.dynamics.simulator import Simulator
+from gns_pyg.scene.requirements import Requires, resolve
+from gns_pyg.scene.scene import Scene
+
+SCENES = ("hopper_small", "drum_small", "pile", "free", "inclined_drum", "hopper_discharge", "silo_stl")
+SCENES += ("drum_bidisperse", "hopper_friction")
+ROWS = {  # row -> whether leaving it out changes nothing at all
+    "wall_network": True,
+    "wall_velocity": True,
+    "wall_friction": True,
+    "static_walls": True,
+    "reachable_points": True,
+    "free_grains": False,
+    "free_grains (first 0.2 s)": False,
+    "radius_features": True,
+    "material_features": True,
+    "active_mask": True,
+}
+COLUMNS = {"parameters": ",", "edges": ",.0f", "ms": ".1f"}
+FRAMES, ROUNDS, EARLY_S = 12, 7, 0.2
+OUT = Path(__file__).parent / "results" / "requirements.json"
+
+
+def main() -> None:
+    torch.set_num_threads(1)
+    results = [row for name in sys.argv[1:] or SCENES for row in of_scene(name)]
+    if sys.argv[1:] and OUT.exists():
+        results = [row for row in json.loads(OUT.read_text()) if row["scene"] not in sys.argv[1:]] + results
+    OUT.write_text(json.dumps(results, indent=1) + "\n")
+    print(table(results))
+
+
+def of_scene(name: str) -> list[dict[str, Any]]:
+    """The rows that the scene does without, and what each saves."""
+    with initialize_config_dir(CONF, version_base="1.3"):
+        config = compose("train", [f"scene={name}"])
+    scene, model = Scene.from_config(config.scene), typed(ModelConfig, config.model, "model")
+    cases = [open_case(path, scene) for path in find_cases(scene, None)[:3]]
+    seen = values(cases)
+
+    def simulator(**forced: bool) -> Simulator:
+        return run.build(scene, model, resolve(scene, seen, Requires(**forced)), Split(cases, [], []), seed=0).eval()
+
+    own = simulator()
+    case = cases[0]
+    last, early = case.n_frames - 3, int(EARLY_S / scene.frame_dt_s) - 1
+    rows = []
+    for row, exact in ROWS.items():
+        row, _, when = row.partition(" ")
+        prunes = row in ("static_walls", "reachable_points", "free_grains")
+        if prunes != bool(getattr(own.requires, row)) or (
+            row in ("static_walls", "reachable_points") and own.boundary is None
+        ):
+            continue
+        starts = torch.linspace(0, early if when else last, FRAMES).long().tolist()
+        states = other_states = [own.integrator.read(read_window(case, start, 3), 1) for start in starts]
+        other = simulator(**{row: not prunes})
+        if row == "active_mask":
+            everyone = torch.ones(case.n_grains, dtype=torch.bool)
+            other_states = [replace(state, active=everyone) for state in states]
+        with_ms, without_ms = timed([(own, states), (other, other_states)])
+        found: dict[str, Any] = {
+            "scene": name,
+            "row": f"{row} {when}".strip(),
+            "exact": exact,
+            "parameters_with": n_parameters(own),
+            "parameters_without": n_parameters(other),
+            "edges_with": median(n_edges(own, state) for state in states),
+            "edges_without": median(n_edges(other, state) for state in states),
+            "ms_with": with_ms,
+            "ms_without": without_ms,
+        }
+        if row == "free_grains":
+            found |= against_yade(own, case, early + 2 if when else last + 1)
+        print(json.dumps(found), flush=True)
+        rows.append(found)
+    return rows
+
+
+@torch.inference_mode()
+def timed(pairs: list) -> list[float]:
+    """Median over rounds of milliseconds per step, the variants in turn."""
+    ms: list[list[float]] = [[] for _ in pairs]
+    for simulator, states in pairs:
+        simulator(states[0])
+    for _ in range(ROUNDS):
+        for index, (simulator, states) in enumerate(pairs):
+            begin = time.perf_counter()
+            for state in states:
+                simulator(state)
+            ms[index].append(1e3 * (time.perf_counter() - begin) / len(states))
+    return [round(median(values), 3) for values in ms]
+
+
+def n_parameters(simulator: Simulator) -> int:
+    return sum(parameter.numel() for parameter in simulator.parameters())
+
+
+def n_edges(simulator: Simulator, state: Any) -> int:
+    graph = simulator.graph(state)
+    return graph.grain_edges.shape[1] + graph.wall_edges.shape[1]
+
+
+def against_yade(simulator: Simulator, case: Trajectory, n_frames: int) -> dict[str, float]:
+    """Share of grains that fly free in the first frames, how far Yade's next position is from theirs, and the share
+    that Yade takes more than 0.1 mm elsewhere: those are hit."""
+    errors, n_grains = [], 0
+    for frame in range(min(n_frames, case.n_frames - 2)):
+        window = read_window(case, frame, 3)
+        state, following = (simulator.integrator.read(window, k) for k in (1, 2))
+        there = torch.from_numpy(case.active(frame + 1, frame + 3).all(axis=0))
+        state, following = state.pick(there), following.pick(there)
+        graph, free = simulator.graph(state), simulator.integrator.without_contact(state)
+        alone = torch.ones(len(state.pos), dtype=torch.bool)
+        alone[graph.grain_edges[1]] = False
+        alone[graph.wall_edges[1]] = False
+        errors.append((free.pos - following.pos).norm(dim=1)[alone])
+        n_grains += len(alone)
+    error = torch.cat(errors)
+    return {
+        "free_share": round(len(error) / n_grains, 4),
+        "free_error_mean_mm": round(1e3 * float(error.mean()), 4) if len(error) else 0.0,
+        "free_error_median_mm": round(1e3 * float(error.median()), 4) if len(error) else 0.0,
+        "free_hit_share": round(float((error > 1e-4).double().mean()), 4) if len(error) else 0.0,
+    }
+
+
+def table(results: list[dict[str, Any]]) -> str:
+    """The results as Markdown."""
+    lines = ["| scene | row | parameters | edges | ms per step | time saved |", "|---|---|---|---|---|---|"]
+    for r in results:
+        saved = 1 - r["ms_with"] / r["ms_without"]
+        pairs = [f"{r[f'{key}_with']:{form}} / {r[f'{key}_without']:{form}}" for key, form in COLUMNS.items()]
+        lines.append(f"| {' | '.join([r['scene'], r['row'], *pairs, f'{saved:.0%}'])} |")
+    return "\n".join(lines)
+
+
+if __name__ == "__main__":
+    main()
