@@ -11,6 +11,7 @@ import numpy as np
 
 from gns_pyg.config import plain
 from gns_pyg.data.trajectory import TrajectoryWriter
+from gns_pyg.scene.inlet import entries
 from gns_pyg.scene.mesh import build_mesh
 from gns_pyg.scene.scene import Scene
 
@@ -45,24 +46,30 @@ def scene(n_grains: int, n_frames: int, frame_dt_s: float = 0.01, **changes: Any
 
 
 def write_case(
-    path: Path, scene: Scene, pos: np.ndarray, vel: np.ndarray | None = None, ang_vel: np.ndarray | None = None
+    path: Path,
+    scene: Scene,
+    pos: np.ndarray,
+    vel: np.ndarray | None = None,
+    ang_vel: np.ndarray | None = None,
+    active: np.ndarray | None = None,
 ) -> None:
     """Writes positions (n_frames, n_grains, 3) and velocities (0 where None) as a valid case of `scene`.
 
     The run facts are made up: one core, 1e-4 s steps, 12 s of wall clock.
     """
-    n_frames, n_grains = pos.shape[:2]
+    n_frames = len(pos)
     vel, ang_vel = (np.zeros_like(pos) if values is None else values for values in (vel, ang_vel))
     boundary: dict[str, Mapping[str, Any]] = {}
     for name, part in scene.boundary.items():
         mesh = build_mesh(name, part)
         boundary[name] = {"vertices": mesh.vertices, "triangles": mesh.faces, "motion": plain(part.motion)}
-    radius = np.full(n_grains, scene.grains.radius_m)
+    radius = np.repeat(*zip(*scene.grains.counts, strict=True))
     mass = scene.grains.material.density_kg_m3 * 4 / 3 * np.pi * radius**3
     steps = round(scene.frame_dt_s / 1e-4)
-    with TrajectoryWriter(path, plain(scene), radius, mass, boundary, DECIMALS) as writer:
+    with TrajectoryWriter(path, plain(scene), radius, mass, boundary, DECIMALS, active is not None) as writer:
         for frame in range(n_frames):
-            writer.append(frame * steps, frame * scene.frame_dt_s, pos[frame], vel[frame], ang_vel[frame])
+            there = None if active is None else active[frame]
+            writer.append(frame * steps, frame * scene.frame_dt_s, pos[frame], vel[frame], ang_vel[frame], there)
         run = {"wall_clock_s": 12.0, "cores": 1, "steps": (n_frames - 1) * steps, "dt_s": 1e-4}
         writer.finish(run | {"creator": "tests", "creator_version": "1", "case": 0, "seed": scene.seed})
 
@@ -144,3 +151,35 @@ def rotating_box_case(path: Path, n_outside: int = 0, n_frames: int = 21, rate_r
     ang_vel = np.broadcast_to([rate_rad_s, 0.0, 0.0], pos.shape)
     write_case(path, turning, pos, np.cross(ang_vel, pos), ang_vel)
     return turning
+
+
+def passing_case(path: Path, n_falling: int = 8, n_frames: int = 31) -> Scene:
+    """Grains far apart that fall out through an outlet, one after the other, while two enter through an inlet.
+
+    Nothing touches, so every grain flies freely while it is there; the highest one stays to the end. Grain radii are
+    5 and 10 mm.
+    """
+    inlet = {"count": 2, "rate_per_s": 10.0, "center_m": [0.0, 1.0, 0.3], "size_m": [0.1, 0.1]}
+    count = n_falling + inlet["count"]
+    changes: dict[str, Any] = {
+        "boundary": {},
+        "outlet": {"point_m": [0.0, 0.0, -0.15], "normal": [0.0, 0.0, -1.0]},
+        "inlet": inlet | {"velocity_m_s": [0.0, 0.0, -1.0]},
+    }
+    passing = scene(count, n_frames, **changes)
+    passing.grains.radius_m = [RADIUS_M, RADIUS_M / 2]
+    time = passing.frame_dt_s * np.arange(n_frames)[:, None]
+    plan, drop = entries(passing), np.linspace(0.4, -0.1, n_falling)
+    start = np.concatenate([np.stack([0.1 * np.arange(n_falling), 0 * drop, drop], axis=1), plan.pos])
+    speed = np.concatenate([np.zeros((n_falling, 3)), plan.vel])
+    entered_s = np.concatenate([np.zeros(n_falling), plan.time_s])
+    flown = np.maximum(time - entered_s, 0.0)[:, :, None]
+    gravity = np.array(passing.gravity_m_s2)
+    pos = start + speed * flown + gravity / 2 * flown**2
+    active = (time >= entered_s - 1e-9) & (pos[:, :, 2] > -0.15)
+    vel, first = speed + gravity * flown, active.argmax(axis=0)
+    for frame in range(1, len(pos)):
+        left = ~active[frame] & ~active[frame - 1] & (frame > first)
+        pos[frame, left] = pos[frame - 1, left]
+    write_case(path, passing, pos, np.where(active[:, :, None], vel, 0.0), active=active)
+    return passing

@@ -4,15 +4,15 @@ A network that does not beat these has learned nothing; every error is reported 
 """
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
 import torch
 
 from gns_pyg.data.trajectory import Trajectory
-from gns_pyg.evaluation.errors import position_error
-from gns_pyg.evaluation.observables import angle_of_repose, center_of_mass, from_frame
+from gns_pyg.evaluation.errors import mean_present, nanmax, nanmean, position_error, positions
+from gns_pyg.evaluation.observables import angle_of_repose, center_of_mass, from_frame, outflow
 from gns_pyg.scene.free_flight import free_flight
 from gns_pyg.scene.scene import Scene
 
@@ -29,14 +29,16 @@ def trivial_errors(trajectory: Trajectory, scene: Scene) -> dict[str, np.ndarray
     - `last displacement + free-flight acceleration`: x + d + a dt^2.
     - `instantaneous velocity, free flight`: x + v dt + a dt^2 / 2.
 
-    The acceleration a is the scene's own free-flight law, gravity with the DEM's damping.
+    The acceleration a is the scene's own free-flight law, gravity with the DEM's damping (of this case, where it
+    varies). All predict the same grains: those present in the frame, the one before and the next.
 
     Returns:
         predictor name -> (n_frames - 2,), m: errors of frames 2, 3, ..., n_frames - 1.
     """
-    pos, vel, dt_s = trajectory.read("position"), trajectory.read("velocity"), trajectory.frame_dt_s
-    now, truth = pos[1:-1], pos[FIRST_FRAME:]
-    last = now - pos[:-2]
+    pos, vel, dt_s = positions(trajectory), trajectory.read("velocity"), trajectory.frame_dt_s
+    scene = replace(scene, damping=trajectory.scene["damping"])
+    last, truth = pos[1:-1] - pos[:-2], pos[FIRST_FRAME:]
+    now = np.where(np.isnan(last), np.nan, pos[1:-1])
     by_difference = _fly(now, last / dt_s, scene, dt_s)
     predicted = {
         "frozen": now,
@@ -56,7 +58,7 @@ def best_trivial(cases: Sequence[Mapping[str, np.ndarray]]) -> tuple[str, float]
     Returns:
         (name, mean error, m).
     """
-    means = {name: float(np.mean([case[name].mean() for case in cases])) for name in cases[0]}
+    means = {name: nanmean(np.array([nanmean(case[name]) for case in cases])) for name in cases[0]}
     best = min(means, key=lambda name: means[name])
     return best, means[best]
 
@@ -75,11 +77,13 @@ class Climatology:
         times_s: (n_frames,), s.
         center_of_mass_m: (n_frames, 3), m.
         angle_of_repose_deg: (n_frames,), degrees; None where the scene defines no angle of repose.
+        outflow: (n_frames,), part of the grains at t = 0 that have left; None where the scene has no outlet.
     """
 
     times_s: np.ndarray
     center_of_mass_m: np.ndarray
     angle_of_repose_deg: np.ndarray | None
+    outflow: np.ndarray | None = None
 
     @staticmethod
     def from_plain(values: Mapping[str, Any]) -> "Climatology":
@@ -93,7 +97,15 @@ class Climatology:
 
     def center_of_mass_error_m(self, times_s: np.ndarray, truth: np.ndarray) -> float:
         """Largest distance (3D, over frames) between the mean curve and a case's centre of mass `truth` (n, 3), m."""
-        return float(np.linalg.norm(self.center_of_mass_at(times_s) - truth, axis=1).max())
+        return nanmax(np.linalg.norm(self.center_of_mass_at(times_s) - truth, axis=1))
+
+    def outflow_at(self, times_s: np.ndarray) -> np.ndarray:
+        """The part of the grains there at times_s[0] that have left by `times_s` (n,), (n,); nan without an outlet."""
+        if self.outflow is None:
+            return np.full(len(times_s), np.nan)
+        left = _at(times_s, self.times_s, self.outflow[:, None])[:, 0]
+        with np.errstate(invalid="ignore"):
+            return (left - left[0]) / (1 - left[0])
 
     def mean_angle_of_repose_deg(self, scene: Scene) -> float:
         """The mean angle of repose of the training cases over the frames from `from_s` on; nan if none is defined."""
@@ -105,20 +117,17 @@ class Climatology:
 def climatology(trajectories: Sequence[Trajectory], scene: Scene) -> Climatology:
     """Averages the training cases' curves, aligned by time (linear between frames) on the first case's frames."""
     times_s = trajectories[0].times_s
-    centers, angles = [], []
+    centers, angles, left = [], [], []
     for trajectory in trajectories:
-        pos = trajectory.read("position")
+        pos = positions(trajectory)
         centers.append(_at(times_s, trajectory.times_s, center_of_mass(pos, trajectory.mass)))
         if scene.angle_of_repose is not None:
             angles.append(_at(times_s, trajectory.times_s, angle_of_repose(pos, scene)[:, None])[:, 0])
+        if scene.outlet is not None:
+            left.append(_at(times_s, trajectory.times_s, outflow(pos)[:, None])[:, 0])
     mean_angle = np.array([nanmean(frame) for frame in np.array(angles).T]) if angles else None
-    return Climatology(times_s, np.mean(centers, axis=0), mean_angle)
-
-
-def nanmean(values: np.ndarray) -> float:
-    """Mean of the finite values; nan (without a warning) where there are none."""
-    finite = values[np.isfinite(values)]
-    return float(finite.mean()) if len(finite) else float("nan")
+    mean_left = mean_present(np.array(left), axis=0) if left else None
+    return Climatology(times_s, mean_present(np.array(centers), axis=0), mean_angle, mean_left)
 
 
 def _at(times_s: np.ndarray, known_s: np.ndarray, curve: np.ndarray) -> np.ndarray:

@@ -12,8 +12,8 @@ import numpy as np
 
 from gns_pyg.data.trajectory import Trajectory
 from gns_pyg.errors import DataError, NumericalError
-from gns_pyg.evaluation.baselines import FIRST_FRAME, Climatology, best_trivial, nanmean, trivial_errors
-from gns_pyg.evaluation.errors import position_error
+from gns_pyg.evaluation.baselines import FIRST_FRAME, Climatology, best_trivial, trivial_errors
+from gns_pyg.evaluation.errors import nanmax, nanmean, position_error, positions
 from gns_pyg.evaluation.observables import (
     angle_of_repose,
     center_of_mass,
@@ -22,6 +22,7 @@ from gns_pyg.evaluation.observables import (
     granular_temperature,
     mean_overlap_ratio,
     mean_speed,
+    outflow,
     time_mean,
 )
 from gns_pyg.scene.scene import Scene
@@ -34,7 +35,8 @@ class CaseResult:
     Attributes:
         name: the case's file name without ending.
         times_s: (n_frames,) s; frame 0 is the state that the roll-out starts from.
-        dem_pos, pos: grain centres by DEM and by roll-out, m, (n_frames, n_grains, 3); frame 0 is the same in both.
+        dem_pos, pos: grain centres by DEM and by roll-out, m, (n_frames, n_grains, 3), nan where a grain is absent;
+            frame 0 is the same in both.
         radius, mass: (n_grains,), m and kg.
         one_step_times_s: (n,) s, times of the frames predicted in one step from DEM's own state, along the whole run.
         one_step_error_m: (n,) m, the model's mean position error there.
@@ -73,7 +75,7 @@ def case_result(
     Args:
         trajectory: the test case.
         scene: its scene.
-        pos: the roll-out, m, (n, n_grains, 3); pos[0] is the DEM's frame `start_frame`.
+        pos: the roll-out, m, (n, n_grains, 3), nan where a grain is absent; pos[0] is the DEM's frame `start_frame`.
         start_frame: frame of the trajectory that the roll-out starts from.
         one_step_error_m: (n,) m, the model's mean one-step error at frames `one_step_first_frame`, ... in a row.
         one_step_first_frame: the first frame predicted in one step.
@@ -91,8 +93,9 @@ def case_result(
             f"(up to {trajectory.n_frames - start_frame}, {trajectory.n_grains}, 3)",
             "roll out the same case, no further than the DEM run goes",
         )
-    if not np.isfinite(pos).all():
-        frame = int(np.argwhere(~np.isfinite(pos).all(axis=(1, 2)))[0, 0])
+    sound = np.isfinite(pos).all(axis=2) | (trajectory.has_active & np.isnan(pos).all(axis=2))
+    if not sound.all():
+        frame = int(np.argwhere(~sound.all(axis=1))[0, 0])
         raise NumericalError(
             f"roll-out of {trajectory.path.name}",
             f"positions that are not finite from frame {start_frame + frame} on",
@@ -113,7 +116,7 @@ def case_result(
     return CaseResult(
         name=trajectory.path.stem,
         times_s=trajectory.times_s[start_frame:stop],
-        dem_pos=trajectory.read("position", start_frame, stop),
+        dem_pos=positions(trajectory, start_frame, stop),
         pos=np.asarray(pos, np.float64),
         radius=trajectory.radius,
         mass=trajectory.mass,
@@ -133,13 +136,14 @@ def _dem_seconds(run: Mapping[str, Any]) -> float:
 
 @dataclass(frozen=True)
 class Observables:
-    """Curves of one set of positions; all (n_frames,) unless said otherwise.
+    """Curves of one set of positions; all (n_frames,) unless said otherwise, nan where there is no grain.
 
     Attributes:
         center_of_mass_m: (n_frames, 3), m.
         angle_of_repose_deg: degrees, or None where the scene defines none.
         overlap_ratio: mean overlap of touching pairs, part of a diameter.
         mean_speed_m_s, granular_temperature_m2_s2: (n_frames - 1,), of the step that leaves the frame.
+        outflow: part of the grains at the start that have left, or None where the scene has no outlet.
     """
 
     center_of_mass_m: np.ndarray
@@ -147,6 +151,7 @@ class Observables:
     overlap_ratio: np.ndarray
     mean_speed_m_s: np.ndarray
     granular_temperature_m2_s2: np.ndarray
+    outflow: np.ndarray | None
 
 
 @dataclass(frozen=True)
@@ -210,6 +215,9 @@ def evaluate_cases(results: Sequence[CaseResult], climatology: Climatology, scen
       `_standard_error_deg`: of the mean over cases, from the cases' own (block averaged) errors;
       `test/angle_of_repose_error_deg`: absolute difference per case; `..._climatology_deg`: of the training cases'
       mean against DEM. Absent where the scene defines no angle of repose.
+    - `test/outflow_final`, `test/outflow_dem_final`: part of the grains at the start that have left at the last frame;
+      `test/outflow_error_max`, `..._climatology_max`: largest difference from DEM over frames, of the roll-out and of
+      the training cases' mean. Absent where the scene has no outlet.
     - `test/escaped_grains`: most at any frame, summed over cases.
     - `test/mean_overlap_ratio`, `..._dem`: mean over frames after the start, part of a diameter.
     - `speed/...`: wall clock per simulated second of roll-out and of Yade, with Yade's cores and time step.
@@ -246,9 +254,9 @@ def _evaluate_case(result: CaseResult, trivial_name: str, climatology: Climatolo
     after_start = result.one_step_times_s > result.times_s[0] + 1e-9
     center = dem.center_of_mass_m
     metrics: dict[str, Any] = {
-        "test/one_step_error_m": float(result.one_step_error_m.mean()),
+        "test/one_step_error_m": nanmean(result.one_step_error_m),
         "test/one_step_error_at_start_m": next(iter(result.one_step_error_m[after_start].tolist()), float("nan")),
-        "test/one_step_error_trivial_m": float(result.trivial_error_m[trivial_name].mean()),
+        "test/one_step_error_trivial_m": nanmean(result.trivial_error_m[trivial_name]),
         "test/rollout_error_final_m": float(error[-1]),
         "test/rollout_error_final_frozen_m": float(frozen[-1]),
         "test/center_of_mass_error_max_m": _largest_distance(model.center_of_mass_m, center),
@@ -266,6 +274,14 @@ def _evaluate_case(result: CaseResult, trivial_name: str, climatology: Climatolo
             "test/angle_of_repose_dem_standard_error_deg": dem_angle_error,
             "test/angle_of_repose_error_deg": abs(angle - dem_angle),
             "test/angle_of_repose_error_climatology_deg": abs(climatology.mean_angle_of_repose_deg(scene) - dem_angle),
+        }
+    if dem.outflow is not None and model.outflow is not None:
+        expected_outflow = climatology.outflow_at(result.times_s)
+        metrics |= {
+            "test/outflow_final": float(model.outflow[-1]),
+            "test/outflow_dem_final": float(dem.outflow[-1]),
+            "test/outflow_error_max": nanmax(np.abs(model.outflow - dem.outflow)),
+            "test/outflow_error_climatology_max": nanmax(np.abs(expected_outflow - dem.outflow)),
         }
     metrics |= {
         "test/escaped_grains": int(escaped.max()),
@@ -286,11 +302,12 @@ def _observe(pos: np.ndarray, result: CaseResult, scene: Scene) -> Observables:
         overlap_ratio=mean_overlap_ratio(pos, result.radius),
         mean_speed_m_s=mean_speed(pos, result.times_s),
         granular_temperature_m2_s2=granular_temperature(pos, result.times_s, result.radius),
+        outflow=None if scene.outlet is None else outflow(pos),
     )
 
 
 def _largest_distance(curve: np.ndarray, truth: np.ndarray) -> float:
-    return float(np.linalg.norm(curve - truth, axis=1).max())
+    return nanmax(np.linalg.norm(curve - truth, axis=1))
 
 
 def write_json(path: str | Path, metrics: Any) -> None:

@@ -1,6 +1,7 @@
 """What an engineer reads from a granular run: functions of positions alone, so that DEM and network are read alike.
 
-Positions `pos` are grain centres, m, (n_frames, n_grains, 3) float64; times `times_s` are (n_frames,) s.
+Positions `pos` are grain centres, m, (n_frames, n_grains, 3) float64, nan where a grain is absent; times `times_s`
+are (n_frames,) s.
 """
 
 import numpy as np
@@ -9,6 +10,7 @@ from scipy.sparse.csgraph import connected_components
 from scipy.spatial import cKDTree
 
 from gns_pyg.errors import ConfigError
+from gns_pyg.evaluation.errors import mean_present, present
 from gns_pyg.scene.containment import outside
 from gns_pyg.scene.mesh import build_mesh
 from gns_pyg.scene.scene import Scene
@@ -20,16 +22,26 @@ CENTRAL_SHARE = 0.75  # of the bed's width across the drum; the surface bends to
 
 
 def center_of_mass(pos: np.ndarray, mass: np.ndarray) -> np.ndarray:
-    """Centre of mass of all grains (escaped ones too), per frame.
+    """Centre of mass of all grains that are present (escaped ones too), per frame.
 
     Args:
         pos: m, (n_frames, n_grains, 3).
         mass: kg, (n_grains,).
 
     Returns:
-        (n_frames, 3), m.
+        (n_frames, 3), m; nan where there is no grain.
     """
-    return np.einsum("fgi,g->fi", pos, mass) / mass.sum()
+    there = present(pos)
+    moment = np.einsum("fgi,g->fi", np.where(there[:, :, None], pos, 0.0), mass)
+    with np.errstate(invalid="ignore"):
+        return moment / np.where(there, mass, 0.0).sum(axis=1)[:, None]
+
+
+def outflow(pos: np.ndarray) -> np.ndarray:
+    """The part of the grains present at the start that have left, per frame, (n_frames,)."""
+    there = present(pos)
+    with np.errstate(invalid="ignore"):
+        return (there[0] & ~there).sum(axis=1) / there[0].sum()
 
 
 # ---------------------------------------------------------------------------------------------- angle of repose
@@ -52,7 +64,7 @@ def angle_of_repose(pos: np.ndarray, scene: Scene) -> np.ndarray:
 
     Args:
         pos: m, (n_frames, n_grains, 3).
-        scene: gives `angle_of_repose`, gravity and the grain radius.
+        scene: gives `angle_of_repose`, gravity and the (largest) grain radius.
 
     Returns:
         (n_frames,), degrees; nan where the surface's grains span less than two cells.
@@ -65,7 +77,8 @@ def angle_of_repose(pos: np.ndarray, scene: Scene) -> np.ndarray:
         raise ConfigError(
             "scene.angle_of_repose", "not defined", "a kind (plane or radial) and from_s", "define it in the scene"
         )
-    radius, up = scene.grains.radius_m, up_direction(scene)
+    radius, up = scene.grains.radii_m[-1], up_direction(scene)
+    beds = [_bed(frame[present(frame)], radius) for frame in pos]
     if definition.kind == "plane":
         axis = np.asarray(definition.axis, np.float64)
         across = np.cross(up, axis)
@@ -74,10 +87,10 @@ def angle_of_repose(pos: np.ndarray, scene: Scene) -> np.ndarray:
                 "scene.angle_of_repose.axis", str(definition.axis), "an axis that is not along gravity", "turn the axis"
             )
         across, axis = across / np.linalg.norm(across), axis / np.linalg.norm(axis)
-        return np.array([_plane_angle(_bed(frame, radius), axis, across, up, radius) for frame in pos])
+        return np.array([_plane_angle(bed, axis, across, up, radius) for bed in beds])
     if definition.kind == "radial":
         middle = _boundary_middle(scene)
-        return np.array([_radial_angle(_bed(frame, radius), middle, up, radius) for frame in pos])
+        return np.array([_radial_angle(bed, middle, up, radius) for bed in beds])
     raise ConfigError("scene.angle_of_repose.kind", definition.kind, "plane or radial", "pick one of them")
 
 
@@ -123,6 +136,8 @@ def time_mean(values: np.ndarray) -> tuple[float, float]:
 
 def _bed(pos: np.ndarray, radius: float) -> np.ndarray:
     """Grains (n, 3) of the largest cluster of one frame (n_grains, 3)."""
+    if len(pos) == 0:
+        return pos
     pairs = cKDTree(pos).query_pairs(BED_GAP_DIAMETERS * 2 * radius, output_type="ndarray")
     links = coo_matrix((np.ones(len(pairs), np.int8), (pairs[:, 0], pairs[:, 1])), shape=(len(pos), len(pos)))
     label = connected_components(links, directed=False)[1]
@@ -130,6 +145,8 @@ def _bed(pos: np.ndarray, radius: float) -> np.ndarray:
 
 
 def _plane_angle(bed: np.ndarray, axis: np.ndarray, across: np.ndarray, up: np.ndarray, radius: float) -> float:
+    if len(bed) == 0:
+        return float("nan")
     along = bed @ axis
     low, high = np.quantile(along, [0.25, 0.75])
     slab = bed[(along >= low) & (along <= high)]
@@ -141,6 +158,8 @@ def _plane_angle(bed: np.ndarray, axis: np.ndarray, across: np.ndarray, up: np.n
 
 
 def _radial_angle(bed: np.ndarray, middle: np.ndarray, up: np.ndarray, radius: float) -> float:
+    if len(bed) == 0:
+        return float("nan")
     east = np.cross(up, np.eye(3)[np.abs(up).argmin()])
     east /= np.linalg.norm(east)
     x, y, height = (bed - middle) @ east, (bed - middle) @ np.cross(up, east), (bed - middle) @ up
@@ -188,9 +207,11 @@ def mean_overlap_ratio(pos: np.ndarray, radius: np.ndarray) -> np.ndarray:
     """
     ratio = np.zeros(len(pos))
     for index, frame in enumerate(pos):
-        pairs = cKDTree(frame).query_pairs(2 * radius.max(), output_type="ndarray")
-        reach = radius[pairs[:, 0]] + radius[pairs[:, 1]]
-        overlap = reach - np.linalg.norm(frame[pairs[:, 0]] - frame[pairs[:, 1]], axis=1)
+        there = present(frame)
+        at, size = frame[there], radius[there]
+        pairs = cKDTree(at).query_pairs(2 * radius.max(), output_type="ndarray")
+        reach = size[pairs[:, 0]] + size[pairs[:, 1]]
+        overlap = reach - np.linalg.norm(at[pairs[:, 0]] - at[pairs[:, 1]], axis=1)
         touching = overlap > 0
         if touching.any():
             ratio[index] = (overlap[touching] / reach[touching]).mean()
@@ -198,44 +219,50 @@ def mean_overlap_ratio(pos: np.ndarray, radius: np.ndarray) -> np.ndarray:
 
 
 def escaped_grains(pos: np.ndarray, times_s: np.ndarray, scene: Scene) -> np.ndarray:
-    """Number of grains outside the boundary (see `scene.containment.outside`), per frame, (n_frames,) int."""
-    return outside(pos, times_s, scene).sum(axis=1)
+    """Number of grains outside the boundary (see `scene.containment.outside`), per frame, (n_frames,) int; one that
+    has left through the outlet is absent, not outside."""
+    return (outside(pos, times_s, scene) & present(pos)).sum(axis=1)
 
 
 # -------------------------------------------------------------------------------------------------- velocities
 
 
 def finite_difference_velocity(pos: np.ndarray, times_s: np.ndarray) -> np.ndarray:
-    """Displacement to the next frame over the time between, m/s, (n_frames - 1, n_grains, 3)."""
+    """Displacement to the next frame over the time between, m/s, (n_frames - 1, n_grains, 3); nan where a grain is
+    absent in one of the two."""
     return np.diff(pos, axis=0) / np.diff(times_s)[:, None, None]
 
 
 def mean_speed(pos: np.ndarray, times_s: np.ndarray) -> np.ndarray:
     """Mean over grains of the finite-difference speed, m/s, (n_frames - 1,): DEM and network read alike, unlike the
     DEM's instantaneous velocity, which a difference over one frame smooths."""
-    return np.linalg.norm(finite_difference_velocity(pos, times_s), axis=2).mean(axis=1)
+    return mean_present(np.linalg.norm(finite_difference_velocity(pos, times_s), axis=2), axis=1)
 
 
 def granular_temperature(pos: np.ndarray, times_s: np.ndarray, radius: np.ndarray) -> np.ndarray:
     """One third of the mean squared velocity fluctuation, <|v - v_local|^2> / 3, per frame.
 
     v is the finite-difference velocity and v_local its mean over the grain itself and all grains whose centre lies
-    within three (largest) radii of its own; a grain alone contributes 0.
+    within three (largest) radii of its own; a grain alone contributes 0. Grains count that are present in the frame
+    and the next.
 
     Args:
         pos: m, (n_frames, n_grains, 3).
         radius: m, (n_grains,).
 
     Returns:
-        (n_frames - 1,), m^2/s^2.
+        (n_frames - 1,), m^2/s^2; nan where there is no grain.
     """
     velocity = finite_difference_velocity(pos, times_s)
-    temperature = np.empty(len(velocity))
-    for index, (frame, vel) in enumerate(zip(pos[:-1], velocity, strict=True)):
-        pairs = cKDTree(frame).query_pairs(3 * radius.max(), output_type="ndarray")
-        total, count = vel.copy(), np.ones(len(frame))
+    temperature = np.full(len(velocity), np.nan)
+    for index, there in enumerate(present(velocity)):
+        if not there.any():
+            continue
+        at, vel = pos[index, there], velocity[index, there]
+        pairs = cKDTree(at).query_pairs(3 * radius.max(), output_type="ndarray")
+        total, count = vel.copy(), np.ones(len(at))
         for this, other in (pairs.T, pairs.T[::-1]):
             np.add.at(total, this, vel[other])
-            count += np.bincount(this, minlength=len(frame))
+            count += np.bincount(this, minlength=len(at))
         temperature[index] = ((vel - total / count[:, None]) ** 2).sum(axis=1).mean() / 3
     return temperature

@@ -1,6 +1,7 @@
 """Running a simulator against a recorded case."""
 
 import time
+from collections.abc import Callable
 from dataclasses import asdict
 from importlib.metadata import version
 from pathlib import Path
@@ -50,24 +51,21 @@ def write_rollout(simulator: Simulator, trajectory: Trajectory, start: int, path
     Returns:
         Wall seconds per simulated second, without the writing.
     """
-    scene, n_steps = simulator.scene, trajectory.n_frames - 1 - start
-    state = initial_state(simulator, trajectory, start)
+    scene, n_steps, state = (
+        simulator.scene,
+        trajectory.n_frames - 1 - start,
+        initial_state(simulator, trajectory, start),
+    )
     stored = {key: n for key, n in scene.dem.decimals.items() if key != "angular_velocity" or state.ang_vel is not None}
-    radius, mass = trajectory.radius, trajectory.mass
-    with TrajectoryWriter(path, asdict(scene), radius, mass, trajectory.boundary, stored) as writer:
+    of_case = asdict(scene) | {key: trajectory.scene[key] for key in ("grains", "damping")}  # they may vary
+    radius, mass, absence = trajectory.radius, trajectory.mass, state.active is not None
+    with TrajectoryWriter(path, of_case, radius, mass, trajectory.boundary, stored, absence) as writer:
 
         def write(step: int, state: State) -> None:
-            spin = None if state.ang_vel is None else state.ang_vel.numpy()
-            writer.append(step, float(state.time_s[0]), state.pos.numpy(), state.vel.numpy(), spin)
+            spin, active = (None if field is None else field.numpy() for field in (state.ang_vel, state.active))
+            writer.append(step, float(state.time_s[0]), state.pos.numpy(), state.vel.numpy(), spin, active)
 
-        write(0, state)
-        states = rollout(simulator, state.to(simulator.scale.device), n_steps)
-        seconds = 0.0
-        for step in range(1, n_steps + 1):
-            begin = time.perf_counter()
-            following = next(states).to("cpu")
-            seconds += time.perf_counter() - begin
-            write(step, following)
+        seconds = _run(simulator, state, n_steps, write)
         writer.finish(
             {
                 "wall_clock_s": seconds,
@@ -86,28 +84,43 @@ def roll_out(simulator: Simulator, trajectory: Trajectory, start: int) -> tuple[
     """Rolls out from the recorded frame `start` to the case's end.
 
     Returns:
-        Positions, m, (n_frames - start, n_grains, 3), the start first, and wall seconds per simulated second.
+        Positions, m, (n_frames - start, n_grains, 3), the start first, nan where a grain is absent, and wall seconds
+        per simulated second.
     """
-    state = initial_state(simulator, trajectory, start).to(simulator.scale.device)
     n_steps = trajectory.n_frames - 1 - start
-    pos = np.empty((n_steps + 1, trajectory.n_grains, 3))
-    pos[0] = state.pos.cpu()
-    begin = time.perf_counter()
-    for step, following in enumerate(rollout(simulator, state, n_steps), 1):
-        pos[step] = following.pos.cpu()
-    return pos, (time.perf_counter() - begin) / (n_steps * simulator.scene.frame_dt_s)
+    pos = np.full((n_steps + 1, trajectory.n_grains, 3), np.nan)
+
+    def keep(step: int, state: State) -> None:
+        there = slice(None) if state.active is None else state.active.numpy()
+        pos[step, there] = state.pos.numpy()[there]
+
+    seconds = _run(simulator, initial_state(simulator, trajectory, start), n_steps, keep)
+    return pos, seconds / (n_steps * simulator.scene.frame_dt_s)
+
+
+def _run(simulator: Simulator, state: State, n_steps: int, see: Callable[[int, State], None]) -> float:
+    """Shows `see` the state and the `n_steps` that follow it, on the CPU; returns the wall seconds of the roll-out."""
+    see(0, state)
+    states, seconds = rollout(simulator, state.to(simulator.scale.device), n_steps), 0.0
+    for step in range(1, n_steps + 1):
+        begin = time.perf_counter()
+        following = next(states).to("cpu")
+        seconds += time.perf_counter() - begin
+        see(step, following)
+    return seconds
 
 
 @torch.inference_mode()
 def one_step_errors(simulator: Simulator, trajectory: Trajectory, batch_size: int = 4) -> np.ndarray:
-    """Mean position error (the paper's (13)), m, of one step from every recorded state: of frames 2 to the last."""
+    """Mean position error (the paper's (13)), m, of one step from every recorded state: of frames 2 to the last, over
+    the grains present in the frame and the two before it (see `trivial_errors`)."""
     errors = []
     for first in range(0, trajectory.n_frames - 2, batch_size):
         frames = range(first, min(first + batch_size, trajectory.n_frames - 2))
         window = Window.collate([read_window(trajectory, frame, 3) for frame in frames]).to(simulator.scale.device)
-        predicted = simulator(simulator.integrator.read(window, 1)).pos
+        predicted, truth = simulator(simulator.integrator.read(window, 1)).pos, window.pos[2]
+        if window.active is not None:
+            truth = torch.where(window.active.all(dim=0)[:, None], truth, torch.nan)
         shape = (len(frames), trajectory.n_grains, 3)
-        errors.append(
-            position_error(predicted.cpu().numpy().reshape(shape), window.pos[2].cpu().numpy().reshape(shape))
-        )
+        errors.append(position_error(predicted.cpu().numpy().reshape(shape), truth.cpu().numpy().reshape(shape)))
     return np.concatenate(errors)

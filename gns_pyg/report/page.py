@@ -9,7 +9,7 @@ from typing import Any
 
 from gns_pyg.errors import DataError
 from gns_pyg.report.table import metric_rows
-from gns_pyg.scene.scene import Scene
+from gns_pyg.scene.scene import Motion, Scene
 
 STYLE = """
 body { font: 16px/1.5 system-ui, sans-serif; color: #1a1a1a; max-width: 60rem; margin: 2rem auto; padding: 0 1rem; }
@@ -65,21 +65,47 @@ def write_page(
 
 def scene_summary(scene: Scene) -> dict[str, str]:
     """What a reader must know of a scene, in human units."""
-    material, gravity = scene.grains.material, ", ".join(f"{g:g}" for g in scene.gravity_m_s2)
-    walls = []
-    for name, part in scene.boundary.items():
-        turning = f", turning at {part.motion.rate_rad_s:g} rad/s" if part.motion.moves else ""
-        walls.append(f"{name}: {part.shape.get('kind', '?')}, {part.points} boundary points{turning}")
+    material = scene.grains.material
+    walls = [
+        f"{name}: {part.shape.get('kind', '?')}, {part.points} boundary points{_moving(part.motion)}"
+        for name, part in scene.boundary.items()
+    ]
     damped = "gravity included" if scene.damping_on_gravity else "gravity excluded"
-    return {
-        "grains": f"{scene.grains.count} of {2e3 * scene.grains.radius_m:g} mm diameter",
+    summary = {
+        "grains": ", ".join(f"{n} of {2e3 * radius_m:g} mm" for radius_m, n in scene.grains.counts) + " diameter",
         "material": f"{material.density_kg_m3:g} kg/m\N{SUPERSCRIPT THREE}, Young's modulus "
         f"{material.young_modulus_pa:.3g} Pa, friction angle {material.friction_angle_rad:g} rad",
         "boundary": "; ".join(walls) or "none",
-        "gravity": f"({gravity}) m/s\N{SUPERSCRIPT TWO}",
+        "gravity": f"{_vector(scene.gravity_m_s2)} m/s\N{SUPERSCRIPT TWO}",
         "damping": f"{scene.damping:g} ({damped})" if scene.damping else "none",
         "run": f"{scene.duration_s:g} s, a frame every {1e3 * scene.frame_dt_s:g} ms",
     }
+    if scene.vary:
+        values = (f"{name} ({', '.join(f'{v:g}' for v in of)})" for name, of in scene.vary.items())
+        summary["differs from case to case"] = ", ".join(values)
+    if (outlet := scene.outlet) is not None:
+        summary["outlet"] = f"beyond the plane through {_vector(outlet.point_m)} m, outwards {_vector(outlet.normal)}"
+    if (inlet := scene.inlet) is not None:
+        speed = f"{_vector(inlet.velocity_m_s)} m/s"
+        summary["inlet"] = (
+            f"{inlet.count} grains, {inlet.rate_per_s:g} per s, at {_vector(inlet.center_m)} m with {speed}"
+        )
+    return summary
+
+
+def _moving(motion: Motion) -> str:
+    if not motion.moves:
+        return ""
+    verb, unit = ("turning", "rad") if motion.kind == "rotation" else ("moving", "m")
+    if motion.kind == "oscillation":
+        return f", oscillating by {1e3 * motion.amplitude_m:g} mm at {motion.frequency_hz:g} Hz"
+    if motion.function is not None:
+        return f", {verb} by {motion.function} {unit}"
+    return f", {verb} at {motion.rate_rad_s or motion.speed_m_s:g} {unit}/s"
+
+
+def _vector(values: Sequence[float]) -> str:
+    return f"({', '.join(f'{value:g}' for value in values)})"
 
 
 def _metrics(metrics: Mapping[str, Any]) -> str:

@@ -16,11 +16,12 @@ from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 from trimesh import Trimesh
 
+from gns_pyg.evaluation.errors import mean_present, present
 from gns_pyg.evaluation.metrics import CaseEvaluation, Evaluation, Observables
 from gns_pyg.evaluation.observables import finite_difference_velocity
 from gns_pyg.scene.mesh import build_mesh
 from gns_pyg.scene.motion import to_world
-from gns_pyg.scene.scene import Scene
+from gns_pyg.scene.scene import Motion, Scene
 from gns_pyg.scene.symmetry import up_direction
 
 Style = Literal["-", "--", ":"]
@@ -60,6 +61,8 @@ def draw(evaluation: Evaluation, scene: Scene) -> dict[str, Figure]:
     }
     if scene.angle_of_repose is not None:
         figures["angle_of_repose"] = angle_of_repose(evaluation, scene)
+    if scene.outlet is not None:
+        figures["outflow"] = outflow(evaluation, scene)
     return figures
 
 
@@ -87,9 +90,10 @@ def one_step_error(evaluation: Evaluation, scene: Scene) -> Figure:
     common = min((case.result.one_step_times_s for case in evaluation.cases), key=len)
     own = [case.result.one_step_error_m[: len(common)] for case in evaluation.cases]
     trivial = [case.result.trivial_error_m[evaluation.trivial_name][: len(common)] for case in evaluation.cases]
-    axes.plot(common, 1e3 * np.mean(own, axis=0), color=BLUE, linewidth=2.2, label="network")
+    axes.plot(common, 1e3 * mean_present(np.array(own), axis=0), color=BLUE, linewidth=2.2, label="network")
     label = f"best trivial predictor: {evaluation.trivial_name}"
-    axes.plot(common, 1e3 * np.mean(trivial, axis=0), color=VERMILION, linewidth=1.6, linestyle="-.", label=label)
+    beside = 1e3 * mean_present(np.array(trivial), axis=0)
+    axes.plot(common, beside, color=VERMILION, linewidth=1.6, linestyle="-.", label=label)
     frame_ms = 1e3 * scene.frame_dt_s
     return _finish(figure, axes, note=f"one step is {frame_ms:g} ms, always from DEM's own state")
 
@@ -131,6 +135,17 @@ def angle_of_repose(evaluation: Evaluation, scene: Scene) -> Figure:
     return _finish(figure, axes, handles=_style_handles(evaluation, climatology=True), note=note)
 
 
+def outflow(evaluation: Evaluation, scene: Scene) -> Figure:
+    """Part of the grains that have left against time, every test case."""
+    figure, axes = _figure(f"{scene.name}: outflow", "grains that have left (%)")
+    _compare(axes, evaluation, lambda observed: np.zeros(0) if observed.outflow is None else 100 * observed.outflow)
+    times_s = _longest(evaluation)
+    climatology = 100 * evaluation.climatology.outflow_at(times_s)
+    axes.plot(times_s, climatology, color="black", linestyle=CLIMATOLOGY, linewidth=1.8)
+    note = "of those there at the roll-out's start"
+    return _finish(figure, axes, handles=_style_handles(evaluation, climatology=True), note=note)
+
+
 def overlap(evaluation: Evaluation, scene: Scene) -> Figure:
     """Mean overlap of touching pairs against time, every test case."""
     figure, axes = _figure(f"{scene.name}: overlap of touching grains", "mean overlap (% of a diameter)")
@@ -162,8 +177,9 @@ def granular_temperature(evaluation: Evaluation, scene: Scene) -> Figure:
 def snapshots(case: CaseEvaluation, scene: Scene, n_times: int = 4) -> Figure:
     """DEM above network at `n_times` times of one case, grains in their true size coloured by speed.
 
-    Speed is the displacement to the next frame over the time between, in both rows. The view is along the axis of a
-    turning or plane scene, else along a horizontal axis.
+    Speed is the displacement to the next frame over the time between, in both rows; a grain that is not in both
+    frames is not drawn. The view is along the axis of a turning or plane scene, across the way of another moving part,
+    else along a horizontal axis.
     """
     result = case.result
     frames = np.unique(np.linspace(0, len(result.times_s) - 2, n_times).round().astype(int))
@@ -173,8 +189,10 @@ def snapshots(case: CaseEvaluation, scene: Scene, n_times: int = 4) -> Figure:
         name: np.linalg.norm(finite_difference_velocity(pos, result.times_s)[frames], axis=2)
         for name, pos in rows.items()
     }
-    scale = Normalize(0.0, max(float(np.quantile(np.stack(list(speeds.values())), SPEED_QUANTILE)), 1e-6))
-    (left, low), (edge, high) = _frame_of_view(result.dem_pos, scene, right, up)
+    known = np.concatenate([speed[np.isfinite(speed)] for speed in speeds.values()])
+    fast = float(np.quantile(known, SPEED_QUANTILE)) if len(known) else 0.0
+    scale = Normalize(0.0, max(fast, 1e-6))
+    (left, low), (edge, high) = _frame_of_view(case, scene, right, up)
     width = 2.3
     size = (width * len(frames) + 1.0, 2 * width * float(np.clip((high - low) / (edge - left), 0.5, 2.0)) + 0.9)
     figure = _bare_figure(size, "compressed")
@@ -182,7 +200,8 @@ def snapshots(case: CaseEvaluation, scene: Scene, n_times: int = 4) -> Figure:
     diameters = 2 * result.radius
     for row, (name, pos) in zip(grid, rows.items(), strict=True):
         for axes, frame, speed in zip(row, frames, speeds[name], strict=True):
-            order = np.argsort(pos[frame] @ depth)
+            drawn = np.flatnonzero(np.isfinite(speed))
+            order = drawn[np.argsort(pos[frame, drawn] @ depth)]
             points = np.stack([pos[frame][order] @ right, pos[frame][order] @ up], axis=1)
             grains = EllipseCollection(
                 diameters[order], diameters[order], 0.0, units="xy", offsets=points, offset_transform=axes.transData
@@ -265,7 +284,7 @@ def _mean_curve(
 ) -> tuple[np.ndarray, np.ndarray]:
     """Times and mean over cases, as far as all of them reach."""
     shortest = min((case.result.times_s for case in evaluation.cases), key=len)
-    return shortest, factor * np.mean([of(case)[: len(shortest)] for case in evaluation.cases], axis=0)
+    return shortest, factor * mean_present(np.array([of(case)[: len(shortest)] for case in evaluation.cases]), axis=0)
 
 
 def _running_mean(values: np.ndarray, half: int) -> np.ndarray:
@@ -286,23 +305,28 @@ def _view(scene: Scene) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     up = up_direction(scene)
     definition = scene.angle_of_repose
     wanted = [np.asarray(definition.axis, float)] if definition is not None and definition.kind == "plane" else []
-    wanted += [np.asarray(part.motion.axis, float) for part in scene.boundary.values() if part.motion.moves]
+    for motion in (part.motion for part in scene.boundary.values() if part.motion.moves):
+        axis = np.asarray(motion.axis, float)
+        wanted.append(axis if motion.kind == "rotation" else np.cross(up, axis))
     wanted += [np.array([0.0, -1.0, 0.0]), np.array([1.0, 0.0, 0.0])]
     across = (axis - (axis @ up) * up for axis in wanted)
     depth = next(axis / np.linalg.norm(axis) for axis in across if np.linalg.norm(axis) > 1e-6)
     return np.cross(up, depth), up, depth
 
 
-def _frame_of_view(pos: np.ndarray, scene: Scene, right: np.ndarray, up: np.ndarray) -> np.ndarray:
-    """Corners (2, 2) of the view: the still boundary or all of DEM's grains, with a margin."""
-    seen = [pos.reshape(-1, 3)] if not scene.boundary else []
-    for name, part in scene.boundary.items():
-        vertices = build_mesh(name, part).vertices
-        turn = np.linspace(0, 2 * np.pi / abs(part.motion.rate_rad_s), 13) if part.motion.moves else np.zeros(1)
-        placed = to_world(part.motion, torch.tensor(np.array(vertices)), torch.from_numpy(turn))[0]
-        seen.append(placed.reshape(-1, 3).numpy())
+def _frame_of_view(case: CaseEvaluation, scene: Scene, right: np.ndarray, up: np.ndarray) -> np.ndarray:
+    """Corners (2, 2) of the view, with a margin: every place of the boundary, and DEM's grains where it does not hold
+    them in."""
+    pos, times_s = case.result.dem_pos, case.result.times_s
+    meshes = {name: build_mesh(name, part) for name, part in scene.boundary.items()}
+    holds = bool(meshes) and all(mesh.is_watertight for mesh in meshes.values())
+    seen = [] if holds else [pos[present(pos)]]
+    for name, mesh in meshes.items():
+        motion = scene.boundary[name].motion
+        turn_s = np.linspace(0, 2 * np.pi / abs(motion.rate_rad_s), 13) if motion.rate_rad_s else times_s
+        seen += [_placed(mesh, motion, float(time_s)) for time_s in (turn_s if motion.moves else [0.0])]
     points = np.concatenate(seen) @ np.stack([right, up], axis=1)
-    margin = 0.04 * np.ptp(points, axis=0).max() + scene.grains.radius_m * (not scene.boundary)
+    margin = 0.04 * np.ptp(points, axis=0).max() + scene.grains.radii_m[-1] * (not holds)
     return np.stack([points.min(axis=0) - margin, points.max(axis=0) + margin])
 
 
@@ -311,11 +335,16 @@ def _wall_lines(scene: Scene, time_s: float, right: np.ndarray, up: np.ndarray, 
     lines = []
     for name, part in scene.boundary.items():
         mesh = build_mesh(name, part)
-        vertices = torch.tensor(np.array(mesh.vertices))
-        placed = to_world(part.motion, vertices, torch.tensor([time_s], dtype=torch.float64))[0][0].numpy()
+        placed = _placed(mesh, part.motion, time_s)
         edges = _silhouette(Trimesh(placed, mesh.faces, process=False), depth)
         lines.append(placed[edges] @ np.stack([right, up], axis=1))
     return LineCollection([edge for part_lines in lines for edge in part_lines], colors="0.3", linewidths=0.8)
+
+
+def _placed(mesh: Trimesh, motion: Motion, time_s: float) -> np.ndarray:
+    """Vertices of a part at `time_s`, (n, 3), m."""
+    vertices = torch.tensor(np.array(mesh.vertices))
+    return to_world(motion, vertices, torch.full((len(vertices),), time_s, dtype=torch.float64))[0].numpy()
 
 
 def _silhouette(mesh: Trimesh, depth: np.ndarray) -> np.ndarray:

@@ -24,6 +24,9 @@ def metric_rows(metrics: Mapping[str, Any]) -> list[tuple[str, str, str]]:
     def millimetres(key: str) -> str:
         return _number(metrics.get(key), 1e3, " mm")
 
+    def percent(key: str) -> str:
+        return _number(metrics.get(key), 100.0, " %")
+
     def degrees(key: str) -> str:
         return _number(metrics.get(key), 1.0, "\N{DEGREE SIGN}")
 
@@ -66,6 +69,15 @@ def metric_rows(metrics: Mapping[str, Any]) -> list[tuple[str, str, str]]:
                 f"{degrees('test/angle_of_repose_error_climatology_deg')} mean of training cases",
             ),
         ]
+    if "test/outflow_final" in metrics:
+        rows += [
+            ("grains that have left", percent("test/outflow_final"), f"{percent('test/outflow_dem_final')} DEM"),
+            (
+                "outflow error, largest",
+                percent("test/outflow_error_max"),
+                f"{percent('test/outflow_error_climatology_max')} mean of training cases",
+            ),
+        ]
     own, yade = (metrics.get(f"speed/{name}seconds_per_simulated_second") for name in ("", "yade_"))
     factor = ""
     if own is not None and yade is not None and own > 0:
@@ -79,8 +91,8 @@ def metric_rows(metrics: Mapping[str, Any]) -> list[tuple[str, str, str]]:
     rows += [
         (
             "overlap, of a diameter",
-            _number(metrics.get("test/mean_overlap_ratio"), 100.0, " %"),
-            _number(metrics.get("test/mean_overlap_ratio_dem"), 100.0, " %") + " DEM",
+            percent("test/mean_overlap_ratio"),
+            f"{percent('test/mean_overlap_ratio_dem')} DEM",
         ),
         ("escaped grains, all cases", _count(metrics.get("test/escaped_grains")), ""),
         (

@@ -4,16 +4,16 @@ import numpy as np
 import torch
 from trimesh import Trimesh
 
-from gns_pyg.scene.mesh import build_mesh, distance, inside
+from gns_pyg.scene.mesh import container, distance, inside
 from gns_pyg.scene.motion import to_body
 from gns_pyg.scene.scene import Scene
 
 
 def outside(pos: np.ndarray, times_s: np.ndarray, scene: Scene) -> np.ndarray:
-    """Grains whose centre lies outside every closed part of the boundary.
+    """Grains whose centre lies outside every part of the boundary that holds grains in.
 
-    Positions are carried into each part's body frame, where its mesh is at rest. Scenes without a closed part have
-    no outside.
+    Positions are carried into each part's body frame, where its mesh is at rest. A grain below an open bottom has left
+    through it and is not outside. Scenes without a part that holds grains in have no outside.
 
     Args:
         pos: m, (n_frames, n_grains, 3).
@@ -25,16 +25,17 @@ def outside(pos: np.ndarray, times_s: np.ndarray, scene: Scene) -> np.ndarray:
     out = np.ones(pos.shape[:2], bool)
     closed = 0
     for name, part in scene.boundary.items():
-        mesh = build_mesh(name, part)
-        if not mesh.is_watertight:
+        mesh = container(name, part)
+        if mesh is None:
             continue
+        bottom_m = mesh.bounds[0, 2] if part.shape.get("open_bottom") else -np.inf
         closed += 1
         affordable_m = (mesh.extents.prod() / max(pos.shape[0] * pos.shape[1] / 4, 1)) ** (1 / 3)  # a cell per 4 tests
-        interior = _Interior(mesh, max(2 * scene.grains.radius_m, affordable_m))
+        interior = _Interior(mesh, max(2 * scene.grains.radii_m[0], affordable_m))
         for index, (frame, time_s) in enumerate(zip(pos, times_s, strict=True)):
             at = torch.full((len(frame),), float(time_s), dtype=torch.float64)
-            in_body = to_body(part.motion, torch.from_numpy(np.ascontiguousarray(frame)), at)
-            out[index] &= ~interior(in_body.numpy())
+            in_body = to_body(part.motion, torch.from_numpy(np.ascontiguousarray(frame)), at).numpy()
+            out[index] &= ~interior(in_body) & (in_body[:, 2] >= bottom_m)
     return out if closed else np.zeros_like(out)
 
 

@@ -42,7 +42,7 @@ def entries(scene: Scene) -> Entries:
     room = f"at least {PITCH * largest:g} m each way, room for one grain"
     require(bool((n >= 1).all()), "scene.inlet.size_m", inlet.size_m, room, "widen the inlet")
     speed = float(np.linalg.norm(inlet.velocity_m_s))
-    fastest = speed * n.prod() / (PITCH * largest)
+    fastest = speed * int(n.prod()) / (PITCH * largest)
     possible = f"at most {fastest:.4g} grains per second for this size and velocity"
     require(inlet.rate_per_s <= fastest, "scene.inlet.rate_per_s", inlet.rate_per_s, possible, "lower it")
     pitch = np.array(inlet.size_m) / n

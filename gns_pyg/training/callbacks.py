@@ -15,7 +15,7 @@ from gns_pyg.data.trajectory import Trajectory
 from gns_pyg.dynamics.simulator import Simulator
 from gns_pyg.errors import NumericalError
 from gns_pyg.evaluation import observables
-from gns_pyg.evaluation.errors import position_error
+from gns_pyg.evaluation.errors import nanmax, nanmean, position_error, positions
 from gns_pyg.evaluation.metrics import write_json
 from gns_pyg.evaluation.predict import one_step_errors, roll_out, start_frame
 from gns_pyg.training.module import TrainingModule
@@ -84,8 +84,8 @@ def rollout_metrics(
     has no curves.
     """
     start = start_frame(case, start_s)
-    scene, dem, times = simulator.scene, case.read("position", start), case.times_s[start:]
-    metrics = {"one_step_error_m": float(one_step_errors(simulator, case).mean())}
+    scene, dem, times = simulator.scene, positions(case, start), case.times_s[start:]
+    metrics = {"one_step_error_m": nanmean(one_step_errors(simulator, case))}
     diverged = ["rollout_error_final_m", "center_of_mass_error_max_m", "mean_overlap_ratio", "escaped_grains"]
     diverged += ["angle_of_repose_error_deg"] if scene.angle_of_repose is not None else []
     try:
@@ -96,7 +96,7 @@ def rollout_metrics(
     error = position_error(pos, dem)
     metrics |= {
         "rollout_error_final_m": float(error[-1]),
-        "center_of_mass_error_max_m": float(np.linalg.norm(com - com_dem, axis=1).max()),
+        "center_of_mass_error_max_m": nanmax(np.linalg.norm(com - com_dem, axis=1)),
         "mean_overlap_ratio": float(observables.mean_overlap_ratio(pos, case.radius).mean()),
         "escaped_grains": float(observables.escaped_grains(pos, times, scene).max()),
     }

@@ -8,10 +8,12 @@ import pytest
 from gns_pyg.data.trajectory import Trajectory
 from gns_pyg.errors import DataError
 from gns_pyg.evaluation.baselines import climatology
+from gns_pyg.evaluation.errors import positions
 from gns_pyg.evaluation.metrics import case_result, evaluate_cases
-from gns_pyg.report.page import write_page
+from gns_pyg.report.page import scene_summary, write_page
 from gns_pyg.report.plots import draw, write_plots
 from gns_pyg.report.table import metrics_table
+from gns_pyg.scene.scene import Motion
 from tests import scenes
 
 
@@ -50,6 +52,42 @@ def test_a_turning_scene_without_angle_of_repose(tmp_path):
     assert "angle_of_repose" not in figures
     figures["snapshots"].savefig(tmp_path / "snapshots.png")
     assert "angle of repose" not in metrics_table(evaluation.metrics, "turning", {})
+
+
+def test_a_scene_that_grains_pass_through_without_a_boundary(tmp_path):
+    scene = scenes.passing_case(tmp_path / "passing.h5")
+    case = Trajectory(tmp_path / "passing.h5")
+    pos = positions(case, 1)
+    pos[20:] = np.nan  # the model has run empty
+    result = case_result(case, scene, pos, 1, np.full(case.n_frames - 2, 5e-4), 2, seconds_per_simulated_second=2.0)
+    evaluation = evaluate_cases([result], climatology([case], scene), scene)
+    files = write_plots(evaluation, scene, tmp_path / "plots")
+    assert {"outflow", "snapshots"} <= {file.stem for file in files}
+    text = metrics_table(evaluation.metrics, "passing", {})
+    assert re.search(r"grains that have left +100 % +\d+\.\d % DEM", text)
+    assert re.search(r"outflow error, largest +\d+\.\d % +0\.00 % mean of training cases", text)
+    assert scene_summary(scene)["grains"] == "5 of 20 mm, 5 of 10 mm diameter"
+    assert {"outlet", "inlet"} <= set(scene_summary(scene))
+
+
+@pytest.mark.parametrize(
+    ("motion", "words"),
+    [
+        ({}, "floor, 50 boundary points"),
+        (
+            {"kind": "oscillation", "axis": [1.0, 0.0, 0.0], "amplitude_m": 0.02, "frequency_hz": 3.0},
+            "by 20 mm at 3 Hz",
+        ),
+        ({"kind": "translation", "axis": [0.0, 1.0, 0.0], "speed_m_s": 0.1}, "moving at 0.1 m/s"),
+        ({"kind": "rotation", "axis": [0.0, 0.0, 1.0], "function": "0.5 * t**2"}, "turning by 0.5 * t**2 rad"),
+    ],
+)
+def test_open_moving_parts_are_drawn_and_described(tmp_path, motion, words):
+    scene = scenes.heap_case(tmp_path / "heap.h5", "radial", angle_deg=25.0, n_frames=21)
+    part = scene.boundary["walls"]
+    part.shape, part.points, part.motion = {"kind": "floor", "size_m": [0.4, 0.4]}, 50, Motion(**motion)
+    draw(evaluate(tmp_path / "heap.h5", scene), scene)["snapshots"].savefig(tmp_path / "snapshots.png")
+    assert words in scene_summary(scene)["boundary"]
 
 
 def test_table_states_human_units_beside_what_they_are_judged_by(heap):
