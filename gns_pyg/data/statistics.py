@@ -21,30 +21,25 @@ def measure(trajectories: Sequence[Trajectory], integrator: Integrator) -> Stati
         last = trajectory.n_frames - 3
         for start in np.unique(np.linspace(0, max(last, 0), FRAMES_PER_CASE).astype(int)):
             window = read_window(trajectory, int(start), 3)
-            there = np.logical_and.reduce(trajectory.active(int(start) + 1, int(start) + 3))
-            if not there.any():
+            grains = torch.from_numpy(trajectory.active(int(start) + 1, int(start) + 3).all(axis=0))
+            if not grains.any():
                 continue
-            grains = torch.from_numpy(there)
             state, following = (integrator.read(window, frame).pick(grains) for frame in (1, 2))
             velocity.append(state.vel.square().mean())
             spin.append(window.ang_vel[1, grains].square().mean())
             position.append(state.pos)
             groups = integrator.target(state, following).split(3, dim=1)
             corrections.append(torch.stack([group.square().mean() for group in groups]))
-    everywhere = torch.cat(position)
+    everywhere, mean, std = torch.cat(position), values.mean(axis=0), values.std(axis=0)
     return Statistics(
         velocity_m_s=_root(velocity),
         spin_rad_s=max(_root(spin), 1e-12),
         correction=torch.stack(corrections).mean(0).sqrt().tolist(),
         position_mean_m=everywhere.mean(0).tolist(),
         position_std_m=float((everywhere - everywhere.mean(0)).square().mean().sqrt()),
-        parameters_mean=values.mean(axis=0).tolist(),
-        parameters_std=[std if std > 1e-9 * abs(mean) else 1.0 for std, mean in zip(*_moments(values), strict=True)],
+        parameters_mean=mean.tolist(),
+        parameters_std=np.where(std > 1e-9 * np.abs(mean), std, 1.0).tolist(),
     )
-
-
-def _moments(values: np.ndarray) -> tuple[list[float], list[float]]:
-    return values.std(axis=0).tolist(), values.mean(axis=0).tolist()
 
 
 def _root(squares: list[torch.Tensor]) -> float:

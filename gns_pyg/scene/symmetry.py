@@ -11,6 +11,7 @@ from scipy.spatial import cKDTree
 from torch import Tensor
 from trimesh import Trimesh
 
+from gns_pyg.scene.inlet import entries
 from gns_pyg.scene.mesh import build_mesh, distance
 from gns_pyg.scene.scene import Scene
 
@@ -65,8 +66,8 @@ def symmetry(scene: Scene) -> Symmetry:
     """Finds a scene's symmetry by trying maps on its boundary, motions, outlet, inlet and initial region.
 
     Only vertices that match and triangles that lie on the surface count, so that a mesh whose flat faces are divided
-    unevenly may have more symmetry than is found here. Cundall's damping, which acts along x, y and z one by one, is
-    taken for isotropic.
+    unevenly may have more symmetry than is found here. Cundall's damping acts along x, y and z one by one, so that with
+    it only maps that exchange these axes are left.
 
     Raises:
         ConfigError, GeometryError: for a boundary part that cannot be built.
@@ -93,6 +94,7 @@ class _Fixed:
 
     Attributes:
         up: unit vector against gravity.
+        by_axis: damping tells x, y and z from other directions.
         center: a point that every axis and mirror plane must pass through, m.
         points: sets of points, each (n, 3), m.
         vectors: unit vectors and velocities.
@@ -101,6 +103,7 @@ class _Fixed:
 
     def __init__(self, scene: Scene) -> None:
         self.up, self.meshes, z = up_direction(scene), [], np.array([0.0, 0.0, 1.0])
+        self.by_axis = scene.damping > 0 or "damping" in scene.vary
         self.points: list[np.ndarray] = []
         self.vectors: list[np.ndarray] = []
         self.turns: list[tuple[np.ndarray, np.ndarray]] = []
@@ -115,8 +118,7 @@ class _Fixed:
             else:
                 self.vectors.append(axis)
         if (inlet := scene.inlet) is not None:
-            half = np.array([*inlet.size_m, 0.0]) / 2
-            self.points.append(_corners(inlet.center_m - half, inlet.center_m + half))
+            self.points.append(entries(scene).pos)  # the plan is one of many, and has no symmetry of its own
             self.vectors.append(np.array(inlet.velocity_m_s, np.float64))
         initial = scene.initial
         if initial.region_m:
@@ -141,7 +143,8 @@ class _Fixed:
     def under(self, q: np.ndarray) -> bool:
         """Whether everything stays as it is under x -> q (x - center) + center."""
         return (
-            all(np.allclose(q @ v, v, rtol=0, atol=TOLERANCE * np.linalg.norm(v)) for v in self.vectors)
+            not (self.by_axis and np.abs(q - q.round()).max() > TOLERANCE)
+            and all(np.allclose(q @ v, v, rtol=0, atol=TOLERANCE * np.linalg.norm(v)) for v in self.vectors)
             and all(self._turns_alike(q, axis, origin) for axis, origin in self.turns)
             and (self.outlet is None or self._same_plane(q, *self.outlet))
             and all(self._same_set(q, points) for points in self.points)

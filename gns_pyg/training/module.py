@@ -79,7 +79,7 @@ class TrainingModule(pl.LightningModule):
         error = self.simulator.correction(state) - self.simulator.target(state, following)
         if state.active is not None and following.active is not None:
             error = error[state.active & following.active]
-        loss = error.square().mean()
+        loss = error.square().sum() / max(error.numel(), 1)  # 0 where nobody is there
         if not torch.isfinite(loss):
             raise NumericalError(
                 f"training update {self.global_step}",

@@ -15,7 +15,7 @@ def case(path, speed=1.0, friction=0.5, motion=None):
     scene = scenes.scene(3, 5, boundary={"walls": part}, grains=grains)
     vel = np.zeros((5, 3, 3))
     vel[2, 1, 0] = speed
-    scenes.write_case(path, scene, np.zeros((5, 3, 3)) + [[0.0], [0.1], [0.2]], vel)
+    scenes.write_case(path, scene, np.broadcast_to([[0.0], [0.1], [0.2]], vel.shape), vel)
     return scene, Trajectory(path)
 
 

@@ -1,0 +1,79 @@
+"""Trained bundles taken to scenes they have not seen, without training: `python benchmarks/transfer.py`.
+
+Trains a bundle per scene with the default training (kept in runs/transfer/<scene>), evaluates it on its own unseen cases
+and on real Yade runs of changed scenes (made as docs/requirements.md says), and writes benchmarks/results/transfer.json.
+"""
+
+import json
+import logging
+import os
+from pathlib import Path
+from typing import Any
+
+import torch
+from hydra import compose, initialize_config_dir
+
+from benchmarks.ablation import FIGURES
+from gns_pyg import run
+from gns_pyg.config import CONF
+
+OUT = Path(__file__).parent / "results" / "transfer.json"
+DATA = Path(os.environ.get("GNS_DATA", "data"))
+CHANGES: dict[str, dict[str, tuple[str, list[str]]]] = {  # scene -> change -> folder of its cases, overrides
+    "hopper_small": {
+        "gravity tilted by 10 degrees": ("hopper_tilted", ["scene.gravity_m_s2=[1.7035,0.0,-9.6610]"]),
+    },
+    "drum_small": {
+        "twice the speed": ("drum_double", ["scene.boundary.drum.motion.rate_rad_s=6.0"]),
+        "half the speed": ("drum_half", ["scene.boundary.drum.motion.rate_rad_s=1.5"]),
+    },
+    "hopper_friction": {
+        "friction angle 0.375 rad, between trained ones": ("hopper_friction_0375", []),
+        "friction angle 0.9 rad, beyond them": ("hopper_friction_09", []),
+    },
+}
+
+
+def main() -> None:
+    torch.set_num_threads(1)
+    logging.basicConfig(level=logging.WARNING, format="%(message)s")
+    rows = []
+    for scene, changes in CHANGES.items():
+        folder = Path("runs/transfer") / scene
+        if not (folder / "bundle" / "bundle.json").exists():
+            run.train(config("train", f"scene={scene}", "callbacks.rollout_metrics=null", f"folder={folder}"))
+        own = run.evaluate(config("evaluate", f"bundle={folder}/bundle", f"folder={folder}/own"))
+        rows.append({"scene": scene, "change": "none", "metrics": own})
+        for change, (cases, overrides) in changes.items():
+            places = [f"bundle={folder}/bundle", f"folder={folder}/{cases}", f"data.dir={DATA}/{cases}"]
+            metrics = run.evaluate(config("evaluate", *places, f"scene={scene}", *overrides))
+            rows.append({"scene": scene, "change": change, "metrics": metrics})
+    OUT.write_text(json.dumps(rows, indent=1) + "\n")
+    print(table(rows))
+
+
+def config(name: str, *overrides: str) -> Any:
+    with initialize_config_dir(CONF, version_base="1.3"):
+        return compose(name, list(overrides))
+
+
+def table(rows: list[dict[str, Any]]) -> str:
+    """The results as Markdown; in brackets what climatology (or, for one step, the best trivial predictor) gives."""
+    beside = {
+        "one_step_error_m": "one_step_error_trivial_m",
+        "center_of_mass_error_max_m": "center_of_mass_error_climatology_max_m",
+        "rollout_error_final_m": "rollout_error_final_frozen_m",
+        "angle_of_repose_error_deg": "angle_of_repose_error_climatology_deg",
+    }
+    lines = [f"| {' | '.join(['scene', 'change', *FIGURES])} |", "|---" * (2 + len(FIGURES)) + "|"]
+    for row in rows:
+        cells = [row["scene"], row["change"]]
+        for key, factor, form in FIGURES.values():
+            value, other = (row["metrics"].get(f"test/{k}") for k in (key, beside.get(key)))
+            cells.append(f"{factor * value:{form}}" + ("" if other is None else f" ({factor * other:{form}})"))
+        lines.append(f"| {' | '.join(cells)} |")
+    return "\n".join(lines)
+
+
+if __name__ == "__main__":
+    main()
