@@ -18,6 +18,7 @@ from data_gen.initial import Start
 from gns_pyg.config import require
 from gns_pyg.data.datamodule import check_same_scene, find_cases
 from gns_pyg.data.trajectory import Trajectory
+from gns_pyg.evaluation.errors import positions
 from gns_pyg.scene.scene import Scene
 
 DECIMALS = {"position": 10, "velocity": 8, "angular_velocity": 6}  # of continuations: rounding must not add to them
@@ -60,7 +61,8 @@ def stored_state(trajectory: Trajectory, frame: int) -> Start:
     """All that a stored frame holds: positions, instantaneous velocities, angular velocities, its time."""
     names = ("position", "velocity", "angular_velocity")
     pos, vel, ang_vel = (trajectory.read(name, frame, frame + 1)[0] for name in names)
-    return Start(pos, vel, ang_vel, float(trajectory.times_s[frame]))
+    there = trajectory.active(frame, frame + 1)[0]
+    return Start(pos, vel, ang_vel, trajectory.radius, there, float(trajectory.times_s[frame]))
 
 
 def continue_dem(trajectory: Trajectory, scene: Scene, start: Start, n_frames: int) -> np.ndarray:
@@ -73,7 +75,7 @@ def continue_dem(trajectory: Trajectory, scene: Scene, start: Start, n_frames: i
         n_frames: frames to return, the start included.
 
     Returns:
-        Grain centres, m, (n_frames, n_grains, 3).
+        Grain centres, m, (n_frames, n_grains, 3); nan where a grain is not there.
 
     Raises:
         DependencyError: if Yade is not installed.
@@ -86,7 +88,7 @@ def continue_dem(trajectory: Trajectory, scene: Scene, start: Start, n_frames: i
     with tempfile.TemporaryDirectory(prefix="gns_continued_") as folder:
         path = Path(folder) / trajectory.path.name
         run_dem(fine, meshes, start, path, n_frames=n_frames)
-        return Trajectory(path).read("position")
+        return positions(Trajectory(path))
 
 
 def layout(heading: Sequence[str], rows: Sequence[tuple[str, Sequence[float]]]) -> str:

@@ -16,6 +16,7 @@ from trimesh import Trimesh
 from data_gen.initial import Start
 from gns_pyg.config import plain
 from gns_pyg.errors import DataError, DependencyError
+from gns_pyg.scene.inlet import entries
 from gns_pyg.scene.scene import Scene
 
 SCRIPT = Path(__file__).with_name("yade_case.py")
@@ -69,7 +70,9 @@ def run_dem(
             "parent": os.getpid(),
         }
         (Path(folder) / "job.json").write_text(json.dumps(job))
-        arrays: dict[str, Any] = {"pos": start.pos, "vel": start.vel, "ang_vel": start.ang_vel}
+        plan = entries(scene)
+        arrays: dict[str, Any] = {"entry_time_s": plan.time_s, "entry_pos": plan.pos, "entry_vel": plan.vel}
+        arrays |= {name: getattr(start, name) for name in ("pos", "vel", "ang_vel", "radius", "active")}
         for name, mesh in meshes.items():
             arrays[f"vertices/{name}"], arrays[f"triangles/{name}"] = np.array(mesh.vertices), np.array(mesh.faces)
         np.savez(Path(folder) / "arrays.npz", **arrays)

@@ -39,8 +39,8 @@ def generate(config: DictConfig) -> Path:
     Raises:
         GnsError: for an impossible scene, a file from another scene, Yade missing or failing.
     """
-    scene = Scene.from_config(config.scene)
     require(config.case >= 0, "case", config.case, "at least 0", "number cases from 0")
+    scene = Scene.from_config(config.scene).of_case(config.case)
     require(config.cores >= 1, "cores", config.cores, "at least 1", "set cores=1")
     path = Path(config.out) / f"case_{config.case:03d}.h5"
     meshes = {name: build_mesh(name, part) for name, part in scene.boundary.items()}
@@ -67,7 +67,7 @@ def check_finished(path: Path, scene: Scene, meshes: Mapping[str, Trimesh]) -> s
         DataError: if the file is unreadable or comes from another scene; the differences are named.
     """
     trajectory = Trajectory(path)
-    stored, wanted = flat(trajectory.scene), flat(plain(scene))
+    stored, wanted = flat(plain(Scene.from_config(trajectory.scene))), flat(plain(scene))
     differences = {
         key: f"{key}: {stored.get(key, 'not set')} in the file, {wanted.get(key, 'not set')} now"
         for key in sorted({*stored, *wanted})

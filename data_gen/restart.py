@@ -1,8 +1,8 @@
 """What must a state hold? The DEM answers: `python -m data_gen.restart scene=hopper_small` (config: conf/restart.yaml).
 
 Restarts the DEM from parts of stored frames, runs one frame, and compares it with the stored next one. What a restart
-gets wrong is what a model of that state cannot see: an indication which `model.state` to choose, not a bound, since a
-network may average over the unseen.
+gets wrong is what a model of that state cannot see: an indication which `state` the scene should name, not a bound,
+since a network may average over the unseen.
 
 The full state's own error is what no stored frame holds, the load of the contacts' tangential springs, plus rounding
 (`scene.dem.decimals`). The embedded cases keep positions to half a micrometre, velocities to 0.5 mm/s and spins to
@@ -14,6 +14,7 @@ by more than micrometres.
 """
 
 import logging
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -26,13 +27,13 @@ from data_gen.initial import Start
 from gns_pyg.config import CONF, require
 from gns_pyg.data.trajectory import Trajectory
 from gns_pyg.evaluation.baselines import FIRST_FRAME, trivial_errors
-from gns_pyg.evaluation.errors import position_error
+from gns_pyg.evaluation.errors import position_error, positions
 from gns_pyg.evaluation.metrics import write_json
 from gns_pyg.run import entry
 
 log = logging.getLogger(__name__)
 
-STATES = {  # the values of `model.state`, smallest first -> what they hold
+STATES = {  # the values of `requires.state`, smallest first -> what they hold
     "differences": "x, finite-difference velocity",
     "velocity": "x, v",
     "full": "x, v, angular velocity",
@@ -44,7 +45,7 @@ def restart(cfg: DictConfig) -> dict[str, Any]:
     """Restarts the case that `cfg` names at `cfg.times_s` from every kind of state; prints and writes restart.json.
 
     Returns:
-        `times_s`, and per model.state the `position_error_m` at each of them (equation (13) of the paper, one frame
+        `times_s`, and per requires.state the `position_error_m` at each of them (equation (13) of the paper, one frame
         later) and its `mean_position_error_m`; the same of the trivial predictors; `state`: the one that follows.
 
     Raises:
@@ -56,7 +57,7 @@ def restart(cfg: DictConfig) -> dict[str, Any]:
     frames = [frame_at(trajectory, time_s, "times_s", first=1) for time_s in cfg.times_s]
     errors: dict[str, list[float]] = {state: [] for state in STATES}
     for frame in frames:
-        truth = trajectory.read("position", frame + 1, frame + 2)
+        truth = positions(trajectory, frame + 1, frame + 2)
         for state, found in errors.items():
             pos = continue_dem(trajectory, scene, partial_state(trajectory, frame, state), n_frames=2)
             found.append(float(position_error(pos[1:], truth)[0]))
@@ -88,7 +89,7 @@ def partial_state(trajectory: Trajectory, frame: int, state: str) -> Start:
     vel = full.vel
     if state == "differences":
         vel = (full.pos - trajectory.read("position", frame - 1, frame)[0]) / trajectory.frame_dt_s
-    return Start(full.pos, vel, np.zeros_like(full.ang_vel), full.time_s)
+    return replace(full, vel=vel, ang_vel=np.zeros_like(full.ang_vel))
 
 
 def sufficient(mean_error: dict[str, float]) -> str:
@@ -104,7 +105,7 @@ def table(result: dict[str, Any]) -> str:
     rows += [(f"trivial: {name}", [*error, trivial_means[name]]) for name, error in trivial.items()]
     heading = ["mean position error, mm, a frame after t =", *(f"{time_s:g} s" for time_s in result["times_s"]), "mean"]
     state = result["state"]
-    verdict = f"model.state={state} ({STATES[state]}): the smallest within {WITHIN:g} times the full state's error"
+    verdict = f"requires.state={state} ({STATES[state]}): the smallest within {WITHIN:g} times the full state's error"
     return f"{layout(heading, rows)}\n{verdict}"
 
 

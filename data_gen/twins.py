@@ -17,7 +17,7 @@ from omegaconf import DictConfig
 
 from data_gen.continuation import continue_dem, frame_at, layout, open_case, stored_state
 from gns_pyg.config import CONF, require
-from gns_pyg.evaluation.errors import position_error
+from gns_pyg.evaluation.errors import position_error, positions
 from gns_pyg.evaluation.metrics import write_json
 from gns_pyg.run import entry
 
@@ -40,7 +40,7 @@ def twins(cfg: DictConfig) -> dict[str, Any]:
     """
     trajectory, scene = open_case(cfg)
     frame = frame_at(trajectory, cfg.start_s, "start_s")
-    radius, sigma = scene.grains.radius_m, cfg.perturbation_m
+    radius, sigma = scene.grains.radii_m[0], cfg.perturbation_m
     require(isinstance(cfg.pairs, int) and cfg.pairs >= 1, "pairs", cfg.pairs, "at least 1", "e.g. pairs=3")
     require(
         isinstance(sigma, float) and 0 < sigma <= LARGEST * radius,
@@ -67,7 +67,7 @@ def twins(cfg: DictConfig) -> dict[str, Any]:
         "distance_m": distance,
         "mean_distance_m": distance.mean(axis=0),
         "std_distance_m": distance.std(axis=0, ddof=1) if len(distance) > 1 else np.full(n_frames, np.nan),
-        "stored_distance_m": position_error(base, trajectory.read("position", frame)),
+        "stored_distance_m": position_error(base, positions(trajectory, frame)),
     }
     write_json(Path(cfg.folder) / "twins.json", result)
     log.info("%s\n%s", trajectory.path, table(result))

@@ -6,11 +6,13 @@ Prints `frame K N SECONDS` after every stored frame; everything else that Yade p
 """
 
 import json
+import math
 import os
 import shutil
 import sys
 import time
 from pathlib import Path
+from types import SimpleNamespace
 
 import h5py  # noqa: F401
 import numpy as np
@@ -29,11 +31,15 @@ from yade.wrapper import (
     Law2_ScGeom_FrictPhys_CundallStrack,
     NewtonIntegrator,
     RotationEngine,
+    TranslationEngine,
 )
 
 sys.path.append(sys.argv[2])  # last: where ROOT is a site-packages folder, numpy and h5py must stay Yade's own
 from gns_pyg import machine
 from gns_pyg.data.trajectory import TrajectoryWriter
+from gns_pyg.scene.travel import travel
+
+BLOCKED = 0.1  # of the radius: a grain that enters and overlaps another one by more stops the run
 
 
 def rotate(points: np.ndarray, axis: list, origin: list, angle: float) -> np.ndarray:
@@ -53,42 +59,98 @@ def material(values: dict, friction_angle_rad: float) -> FrictMat:
     )
 
 
+class MovingPart:
+    """The facets of a moving part and the engine that moves them."""
+
+    def __init__(self, ids: list, motion: SimpleNamespace, axis: np.ndarray) -> None:
+        self.motion = motion
+        if motion.kind == "rotation":
+            origin = motion.origin_m
+            self.engine = RotationEngine(ids=ids, rotationAxis=axis.tolist(), zeroPoint=origin, rotateAroundZero=True)
+        else:
+            self.engine = TranslationEngine(ids=ids, translationAxis=axis.tolist())
+
+    def set_speed(self, time_s: float, dt_s: float) -> None:
+        """The mean speed of the step from `time_s` on: so the pose at its end is exact."""
+        speed = (travel(self.motion, time_s + dt_s, math) - travel(self.motion, time_s, math)) / dt_s
+        if self.motion.kind == "rotation":
+            self.engine.angularVelocity = speed
+        else:
+            self.engine.velocity = speed
+
+
 def add_part(part: dict, triangles: np.ndarray, grain_material: dict, time_s: float) -> list:
-    """Adds the facets of a part in its pose at `time_s`; returns the engines that move it."""
-    motion = part["motion"]
-    moves = motion["kind"] == "rotation" and motion["rate_rad_s"] != 0
+    """Adds the facets of a part in its pose at `time_s`; returns its `MovingPart` if it moves."""
+    motion = SimpleNamespace(**part["motion"])
+    moves = motion.kind != "none"
     if moves:
-        triangles = rotate(triangles, motion["axis"], motion["origin_m"], motion["rate_rad_s"] * time_s)
+        axis, come = np.array(motion.axis) / np.linalg.norm(motion.axis), travel(motion, time_s, math)
+        if motion.kind == "rotation":
+            triangles = rotate(triangles, motion.axis, motion.origin_m, come)
+        else:
+            triangles = triangles + come * axis
     wall = material(grain_material, part["friction_angle_rad"])
     ids = O.bodies.append([utils.facet(corners.tolist(), material=wall) for corners in triangles])
-    if not moves:
-        return []
-    engine = RotationEngine(
-        ids=ids,
-        rotationAxis=motion["axis"],
-        zeroPoint=motion["origin_m"],
-        rotateAroundZero=True,
-        angularVelocity=motion["rate_rad_s"],
-    )
-    return [engine]
+    return [MovingPart(ids, motion, axis)] if moves else []
 
 
-def add_grains(scene: dict, arrays: dict) -> list:
-    """Adds the grains with their velocities and spins; returns Yade's bodies in order."""
-    grain_material = scene["grains"]["material"]
-    grain = material(grain_material, grain_material["friction_angle_rad"])
-    bodies = []
-    for pos, vel, ang_vel in zip(arrays["pos"], arrays["vel"], arrays["ang_vel"], strict=True):
-        body = utils.sphere(pos.tolist(), scene["grains"]["radius_m"], material=grain)
-        body.state.vel, body.state.angVel = vel.tolist(), ang_vel.tolist()
-        bodies.append(body)
-    return [O.bodies[i] for i in O.bodies.append(bodies)]
+class Grains:
+    """The grains of a case: those in Yade, those that have left and those that will enter."""
+
+    def __init__(self, scene: dict, arrays: dict) -> None:
+        values = scene["grains"]["material"]
+        self.scene, self.material = scene, material(values, values["friction_angle_rad"])
+        self.radius = arrays["radius"]
+        self.pos, self.vel, self.ang_vel = (arrays[name].copy() for name in ("pos", "vel", "ang_vel"))
+        self.passing = scene["outlet"] is not None or scene["inlet"] is not None
+        self.active = arrays["active"].astype(bool)
+        self.entries = [arrays[f"entry_{name}"] for name in ("time_s", "pos", "vel")]
+        self.first_entry = len(self.radius) - len(self.entries[0])
+        there = np.flatnonzero(self.active).tolist()
+        ids = O.bodies.append([self._sphere(grain) for grain in there])
+        self.bodies = {grain: O.bodies[i] for grain, i in zip(there, ids, strict=True)}
+
+    @property
+    def mass(self) -> np.ndarray:
+        return self.material.density * 4 / 3 * np.pi * self.radius**3
+
+    def frame(self, time_s: float, dt_s: float) -> None:
+        """Reads all grains, then lets those out that are beyond the outlet and those in whose time has come."""
+        # Yade hands out live references: without np.array every frame would hold the last one's values.
+        for grain, body in self.bodies.items():
+            self.pos[grain], self.vel[grain] = np.array(body.state.pos), np.array(body.state.vel)
+            self.ang_vel[grain] = np.array(body.state.angVel)
+        if (outlet := self.scene["outlet"]) is not None:
+            beyond = (self.pos - outlet["point_m"]) @ np.array(outlet["normal"]) > 0
+            for grain in np.flatnonzero(beyond & self.active).tolist():
+                O.bodies.erase(self.bodies.pop(grain).id)
+                self.active[grain], self.vel[grain], self.ang_vel[grain] = False, 0, 0
+        times, pos, vel = self.entries
+        for entry in np.flatnonzero((times > time_s - dt_s + 1e-9) & (times <= time_s + 1e-9)).tolist():
+            self._enter(self.first_entry + entry, pos[entry], vel[entry], time_s)
+
+    def _enter(self, grain: int, pos: np.ndarray, vel: np.ndarray, time_s: float) -> None:
+        gap = np.linalg.norm(self.pos[self.active] - pos, axis=1) - self.radius[self.active] - self.radius[grain]
+        if len(gap) and gap.min() < -BLOCKED * self.radius[grain]:
+            raise SystemExit(
+                f"scene.inlet is blocked at t = {time_s:g} s: grain {grain} would enter {-gap.min():.3g} m deep in "
+                "another one; lower scene.inlet.rate_per_s or move the inlet away"
+            )
+        self.pos[grain], self.vel[grain], self.active[grain] = pos, vel, True
+        self.bodies[grain] = O.bodies[O.bodies.append(self._sphere(grain))]
+
+    def _sphere(self, grain: int) -> object:
+        body = utils.sphere(self.pos[grain].tolist(), float(self.radius[grain]), material=self.material)
+        body.state.vel, body.state.angVel = self.vel[grain].tolist(), self.ang_vel[grain].tolist()
+        return body
 
 
-def steps_per_frame(scene: dict) -> int:
-    """Whole number of DEM steps in a frame, none longer than the scene's time step."""
-    dt = scene["dem"]["dt_s"]
-    longest = utils.PWaveTimeStep() / 3 if dt == "auto" else float(dt)
+def steps_per_frame(scene: dict, smallest_radius_m: float) -> int:
+    """Whole number of DEM steps in a frame, none longer than the scene's time step; `auto` is a third of the time that
+    a pressure wave takes through the smallest grain (Yade's PWaveTimeStep)."""
+    dt, values = scene["dem"]["dt_s"], scene["grains"]["material"]
+    wave_s = smallest_radius_m * math.sqrt(values["density_kg_m3"] / values["young_modulus_pa"])
+    longest = wave_s / 3 if dt == "auto" else float(dt)
     return int(np.ceil(scene["frame_dt_s"] / longest * (1 - 1e-9)))
 
 
@@ -103,45 +165,43 @@ def run(folder: Path) -> None:
         vertices, triangles = arrays[f"vertices/{name}"], arrays[f"triangles/{name}"]
         boundary[name] = {"vertices": vertices, "triangles": triangles, "motion": part["motion"]}
         moving += add_part(part, vertices[triangles], scene["grains"]["material"], time_s)
-    grains = add_grains(scene, arrays)
-    per_frame = steps_per_frame(scene)
+    grains = Grains(scene, arrays)
+    per_frame = steps_per_frame(scene, grains.radius.min())
     O.dt = scene["frame_dt_s"] / per_frame
     O.engines = [
         ForceResetter(),
         InsertionSortCollider(
             [Bo1_Sphere_Aabb(), Bo1_Facet_Aabb()],
-            verletDist=scene["dem"]["verlet_distance_ratio"] * scene["grains"]["radius_m"],
+            verletDist=scene["dem"]["verlet_distance_ratio"] * float(grains.radius.min()),
         ),
         InteractionLoop(
             [Ig2_Sphere_Sphere_ScGeom(), Ig2_Facet_Sphere_ScGeom()],
             [Ip2_FrictMat_FrictMat_FrictPhys()],
             [Law2_ScGeom_FrictPhys_CundallStrack()],
         ),
-        *moving,
+        *[part.engine for part in moving],
         NewtonIntegrator(
             gravity=scene["gravity_m_s2"], damping=scene["damping"], dampGravity=scene["damping_on_gravity"]
         ),
     ]
-    n_frames, n_grains = job["n_frames"], len(grains)
-    radius = np.array([body.shape.radius for body in grains])
-    mass = np.array([body.state.mass for body in grains])
-    decimals = scene["dem"]["decimals"]
+    n_frames, decimals = job["n_frames"], scene["dem"]["decimals"]
     wall_clock_s = cpu_time_s = 0.0
-    with TrajectoryWriter(job["path"], scene, radius, mass, boundary, decimals) as writer:
+    with TrajectoryWriter(
+        job["path"], scene, grains.radius, grains.mass, boundary, decimals, with_active=grains.passing
+    ) as writer:
         for frame in range(n_frames):
             if frame:
                 wall, cpu = time.perf_counter(), time.process_time()
                 for _ in range(per_frame):  # O.run(n, wait=True) polls every 40 ms and would spoil the clock
+                    for part in moving:
+                        part.set_speed(time_s + O.time, O.dt)
                     O.step()
                 wall_clock_s += time.perf_counter() - wall
                 cpu_time_s += time.process_time() - cpu
-            # Yade hands out live references: without np.array every frame would hold the last one's values.
-            states = [body.state for body in grains]
-            pos, vel, ang_vel = (
-                np.array([np.array(getattr(state, name)) for state in states]).reshape(n_grains, 3)
-                for name in ("pos", "vel", "angVel")
-            )
-            writer.append(frame * per_frame, time_s + frame * scene["frame_dt_s"], pos, vel, ang_vel)
+            now_s = time_s + frame * scene["frame_dt_s"]
+            if frame:
+                grains.frame(now_s, scene["frame_dt_s"])
+            writer.append(frame * per_frame, now_s, grains.pos, grains.vel, grains.ang_vel, grains.active)
             print("frame", frame + 1, n_frames, f"{wall_clock_s:.3f}", flush=True)
             if os.getppid() != job["parent"]:
                 raise SystemExit("the process that started this run is gone: stopping")

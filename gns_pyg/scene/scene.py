@@ -83,7 +83,7 @@ class Grains:
             "use spheres, with a higher friction angle to stand for the shape",
         )
         key, radii = "scene.grains.radius_m", self.radius_m if isinstance(self.radius_m, list) else [self.radius_m]
-        numbers = bool(radii) and all(isinstance(r, Real) and math.isfinite(r) and r > 0 for r in radii)
+        numbers = bool(radii) and all(finite([r], 1) and r > 0 for r in radii)
         require(numbers, key, self.radius_m, "a finite number above 0 m, or a list of them", f"e.g. {key}=0.01")
         require(len(set(radii)) == len(radii), key, self.radius_m, "every radius once", "give its part in share")
         share, key = self.share, "scene.grains.share"

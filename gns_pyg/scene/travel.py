@@ -51,7 +51,7 @@ def _evaluate(text: str, t: Any, library: Any) -> Any:
 
 
 def _value(node: ast.AST, names: dict[str, Any], library: Any) -> Any:
-    if isinstance(node, ast.Constant) and type(node.value) in (int, float):
+    if isinstance(node, ast.Constant) and isinstance(node.value, int | float):
         return float(node.value)
     if isinstance(node, ast.Name) and node.id in names:
         return names[node.id]
@@ -60,7 +60,7 @@ def _value(node: ast.AST, names: dict[str, Any], library: Any) -> Any:
     if isinstance(node, ast.BinOp) and type(node.op) in OPERATORS:
         left, right = (_value(side, names, library) for side in (node.left, node.right))
         return OPERATORS[type(node.op)](left, right)
-    if isinstance(node, ast.Call) and isinstance(node.func, ast.Name) and node.func.id in FUNCTIONS:
-        if len(node.args) == 1 and not node.keywords:
-            return getattr(library, node.func.id)(_value(node.args[0], names, library))
+    called = node.func.id if isinstance(node, ast.Call) and isinstance(node.func, ast.Name) else ""
+    if isinstance(node, ast.Call) and called in FUNCTIONS and len(node.args) == 1 and not node.keywords:
+        return getattr(library, called)(_value(node.args[0], names, library))
     raise ValueError(f"cannot read {ast.unparse(node)}")

@@ -134,7 +134,7 @@ class TestWithYade:
         assert [holds for holds in STATES.values() if any(line.startswith(f"DEM from {holds} ") for line in lines)] == [
             *STATES.values()
         ]
-        assert lines[-1].startswith("model.state=full ")
+        assert lines[-1].startswith("requires.state=full ")
 
     def test_twins_start_a_micrometre_apart(self, rolling, tmp_path) -> None:
         result = twins(config(tmp_path, *FEW, f"data.dir={rolling}", "start_s=0.03", "pairs=1", name="twins"))
