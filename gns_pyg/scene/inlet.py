@@ -1,5 +1,6 @@
 """When and where grains enter through a scene's inlet: a fixed plan, the same for the DEM and for a roll-out."""
 
+import math
 from dataclasses import dataclass
 
 import numpy as np
@@ -42,8 +43,11 @@ def entries(scene: Scene) -> Entries:
     room = f"at least {PITCH * largest:g} m each way, room for one grain"
     require(bool((n >= 1).all()), "scene.inlet.size_m", inlet.size_m, room, "widen the inlet")
     speed = float(np.linalg.norm(inlet.velocity_m_s))
-    fastest = speed * int(n.prod()) / (PITCH * largest)
-    possible = f"at most {fastest:.4g} grains per second for this size and velocity"
+    frames = max(math.ceil(PITCH * largest / max(speed * scene.frame_dt_s, 1e-12) - 1e-9), 1)
+    fastest = int(n.prod()) / (frames * scene.frame_dt_s)  # a cell is free again after so many frames
+    possible = (
+        f"at most {fastest:.4g} grains per second for this size and velocity, in frames of {scene.frame_dt_s:g} s"
+    )
     require(inlet.rate_per_s <= fastest, "scene.inlet.rate_per_s", inlet.rate_per_s, possible, "lower it")
     pitch = np.array(inlet.size_m) / n
     cells = np.stack(np.divmod(generator.permutation(n.prod()), n[1]), axis=1)

@@ -11,10 +11,11 @@ import trimesh
 from omegaconf import MISSING
 from trimesh import Trimesh
 
-from gns_pyg.config import require, typed
+from gns_pyg.config import CONF, require, typed
 from gns_pyg.errors import GeometryError
 from gns_pyg.scene.scene import Part, finite, positive
 
+PACKAGE = Path(CONF).parent
 BLOCK = 20_000  # point-triangle pairs handled at once: few enough to stay in the processor's cache
 
 
@@ -108,6 +109,8 @@ class File:
 
     def mesh(self, where: str) -> Trimesh:
         path = Path(self.path).expanduser()
+        own = PACKAGE / path  # e.g. conf/scene/silo.stl, wherever this runs
+        path = own if own.is_file() and not path.is_file() else path
         require(path.is_file(), f"{where}.path", f"no file at {path.resolve()}", "a mesh file", "correct the path")
         scale_ok = math.isfinite(self.scale) and self.scale > 0
         require(scale_ok, f"{where}.scale", self.scale, "finite, above 0", "1 for metres, 0.001 for millimetres")
@@ -166,9 +169,15 @@ def build_mesh(name: str, part: Part) -> Trimesh:
 
 def container(name: str, part: Part) -> Trimesh | None:
     """The closed surface, m, that a part holds grains in: its mesh, with the lid that `open_bottom` left out; None
-    for a part that encloses nothing (a floor)."""
+    for a part that encloses nothing (a floor).
+
+    Raises:
+        GeometryError: for a mesh file with a hole.
+    """
     shape = {key: value for key, value in part.shape.items() if key != "open_bottom"}
     mesh = build_mesh(name, replace(part, shape=shape))
+    if shape.get("kind") == "file":
+        require_closed(mesh, f"scene.boundary.{name}")
     return mesh if mesh.is_watertight else None
 
 

@@ -26,8 +26,8 @@ def way(motion: Motion, time_s: Float[Tensor, " b"]) -> tuple[Float[Tensor, " b"
 
     The speed is the complex-step derivative (Squire and Trapp 1998): exact for the analytic functions of `travel`.
     """
-    stepped = travel(motion, torch.complex(time_s, torch.full_like(time_s, STEP_S)), torch)
-    stepped = stepped + torch.zeros_like(time_s)  # a constant function has no shape of its own
+    step = torch.complex(time_s, torch.full_like(time_s, STEP_S))
+    stepped = travel(motion, step, torch) + torch.zeros_like(step)  # a constant function has no shape of its own
     return stepped.real, stepped.imag / STEP_S
 
 

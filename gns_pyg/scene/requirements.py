@@ -150,9 +150,12 @@ def _derive(scene: Scene, parameters: Mapping[str, Sequence[float]]) -> dict[str
             bool(moving),
             f"moving: {', '.join(moving)}" if moving else "no part moves: no wall-velocity feature",
         ),
-        "wall_friction": (len(frictions) > 1, f"{len(frictions)} wall friction angles"),
-        "static_walls": (True, _search(len(parts), len(moving))),
-        "reachable_points": (True, "points and grains out of each other's reach change nothing"),
+        "wall_friction": (
+            len(frictions) > 1,
+            f"wall friction angles, rad: {', '.join(map(str, sorted(frictions))) or 'none'}",
+        ),
+        "static_walls": (bool(parts), _search(len(parts), len(moving))),
+        "reachable_points": (bool(parts), "points and grains out of reach stay out" if parts else "no boundary"),
         "free_flight": (True, f"gravity {scene.gravity_m_s2} m/s^2 with damping {scene.damping} is known, not learned"),
         "free_grains": (True, "grains that can touch nothing within a frame follow it"),
         "radius_features": (

@@ -3,9 +3,10 @@
 These records are also OmegaConf schemas, hence plain containers and no unions beyond primitives.
 """
 
+import cmath
 import itertools
 import math
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from copy import copy
 from dataclasses import dataclass, field, replace
 from numbers import Real
@@ -16,6 +17,9 @@ from omegaconf import MISSING
 from gns_pyg.config import require, typed
 from gns_pyg.errors import ConfigError
 from gns_pyg.scene.travel import FUNCTION, travel
+
+
+FASTEST = 1e6  # rad/s or m/s: a function of time with a higher speed has no finite one (sqrt(t) at t = 0)
 
 
 def positive(where: str, value: float, unit: str = "") -> None:
@@ -159,8 +163,9 @@ class Motion:
     frequency_hz: float = 0.0
     function: str | None = None
 
-    def check(self, where: str) -> None:
-        """Raises ConfigError for a value out of range; `where` is this record's key, which only the scene knows."""
+    def check(self, where: str, times_s: Iterable[float] = (0.0,)) -> None:
+        """Raises ConfigError for a value out of range, or a function that has none at one of `times_s` (0 is the
+        first); `where` is this record's key, which only the scene knows."""
         known = {"none": (), "rotation": ("rate_rad_s",), "translation": ("speed_m_s",)}
         known["oscillation"] = ("amplitude_m", "frequency_hz")
         require(self.kind in known, f"{where}.kind", self.kind, " or ".join(known), "pick one of them")
@@ -180,11 +185,19 @@ class Motion:
         key, constant = f"{where}.function", self.rate_rad_s or self.speed_m_s
         takes = self.kind in ("rotation", "translation") and not constant
         require(takes, key, self.function, "a rotation or translation without a constant rate", "remove one of them")
-        try:
-            at_start = travel(self, 0.0, math)
-        except (ValueError, ArithmeticError) as error:
-            raise ConfigError(key, f"{self.function!r}: {error}", FUNCTION, "e.g. '0.2 * sin(6.28 * t)'") from None
-        require(abs(at_start) < 1e-9, key, f"{self.function!r} is {at_start:g} at t = 0", "0 there", "subtract it")
+        text = repr(self.function[:60])
+        for time_s in times_s:
+            try:
+                way = travel(self, float(time_s), math)
+                speed = travel(self, complex(time_s, 1e-30), cmath).imag / 1e-30  # see `scene.motion.way`
+            except (ValueError, ArithmeticError) as error:
+                found = f"{text} at t = {time_s:g}: {error}"
+                raise ConfigError(key, found, FUNCTION, "e.g. '0.2 * sin(6.28 * t)'") from None
+            real = isinstance(way, float) and math.isfinite(way) and abs(speed) < FASTEST
+            found, known_way = f"{text} is {way:g}, its speed {speed:g}, at t = {time_s:g}", "finite in the whole run"
+            require(real, key, found, known_way, "choose a function that is smooth from t = 0 to scene.duration_s")
+            at_start = time_s != 0 or abs(way) < 1e-9
+            require(at_start, key, f"{text} is {way:g} at t = 0", "0 there", "subtract it")
 
     @property
     def moves(self) -> bool:
@@ -209,12 +222,12 @@ class Part:
     friction_angle_rad: float = MISSING
     motion: Motion = field(default_factory=Motion)
 
-    def check(self, where: str) -> None:
-        """Raises ConfigError for a value out of range; `where` is this record's key, which only the scene knows."""
+    def check(self, where: str, times_s: Iterable[float] = (0.0,)) -> None:
+        """Raises ConfigError for a value out of range (see `Motion.check`)."""
         enough = "see docs/assumptions.md for a sufficient number"
         require(self.points >= 1, f"{where}.points", self.points, "at least 1", enough)
         _friction_angle(f"{where}.friction_angle_rad", self.friction_angle_rad)
-        self.motion.check(f"{where}.motion")
+        self.motion.check(f"{where}.motion", times_s)
 
 
 @dataclass
@@ -345,7 +358,7 @@ class Scene:
         for name, part in self.boundary.items():
             a_word = "a Python identifier: letters, digits and _, no digit first"
             require(name.isidentifier(), f"scene.boundary.{name}", name, a_word, "rename the part")
-            part.check(f"scene.boundary.{name}")
+            part.check(f"scene.boundary.{name}", (frame * self.frame_dt_s for frame in range(self.n_frames)))
         if self.angle_of_repose is not None:
             self.angle_of_repose.check("scene.angle_of_repose")
         if self.inlet is not None:

@@ -5,6 +5,7 @@ cannot run code. They are analytic, which makes the speed exact too (see `scene.
 """
 
 import ast
+import math
 import operator
 from typing import Any
 
@@ -44,7 +45,7 @@ def _evaluate(text: str, t: Any, library: Any) -> Any:
     if len(text) > LONGEST:
         raise ValueError(f"{len(text)} characters, at most {LONGEST}")
     try:
-        tree = ast.parse(text, mode="eval")
+        tree = ast.parse(text.strip(), mode="eval")
     except SyntaxError as error:
         raise ValueError(error.msg) from None
     return _value(tree.body, {"t": t, "pi": 3.141592653589793}, library)
@@ -62,5 +63,6 @@ def _value(node: ast.AST, names: dict[str, Any], library: Any) -> Any:
         return OPERATORS[type(node.op)](left, right)
     called = node.func.id if isinstance(node, ast.Call) and isinstance(node.func, ast.Name) else ""
     if isinstance(node, ast.Call) and called in FUNCTIONS and len(node.args) == 1 and not node.keywords:
-        return getattr(library, called)(_value(node.args[0], names, library))
+        value = _value(node.args[0], names, library)
+        return getattr(math if isinstance(value, float) else library, called)(value)  # torch takes no numbers
     raise ValueError(f"cannot read {ast.unparse(node)}")
