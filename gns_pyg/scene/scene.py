@@ -18,7 +18,6 @@ from gns_pyg.config import require, typed
 from gns_pyg.errors import ConfigError
 from gns_pyg.scene.travel import FUNCTION, travel
 
-
 FASTEST = 1e6  # rad/s or m/s: a function of time with a higher speed has no finite one (sqrt(t) at t = 0)
 
 
@@ -339,7 +338,7 @@ class Scene:
     angle_of_repose: AngleOfRepose | None = None
     outlet: Outlet | None = None
     inlet: Inlet | None = None
-    vary: dict[str, list[float]] = field(default_factory=dict)
+    vary: dict[str, Any] = field(default_factory=dict)
     state: str = "full"
 
     def __post_init__(self) -> None:
@@ -366,7 +365,8 @@ class Scene:
             require(n <= self.grains.count, key, n, f"at most scene.grains.count = {self.grains.count}", "lower it")
         for name, values in self.vary.items():
             require(name in PARAMETERS, f"scene.vary.{name}", "not a parameter", " or ".join(PARAMETERS), "pick one")
-            require(bool(values), f"scene.vary.{name}", values, "a list of values", "e.g. [0.3, 0.5, 0.7]")
+            listed = isinstance(values, list) and bool(values) and finite(values, len(values))
+            require(listed, f"scene.vary.{name}", values, "a list of finite numbers", "e.g. [0.3, 0.5, 0.7]")
             for case in range(len(values)):
                 self._with({name: values[case]})
 
