@@ -55,8 +55,9 @@ def dem_run(path: Path, scene: Scene, start: Start, **arguments) -> Trajectory:
 
 
 def still(pos: list[list[float]], **changes) -> Start:
-    zeros = np.zeros((len(pos), 3))
-    return Start(**({"pos": np.array(pos), "vel": zeros, "ang_vel": zeros} | changes))
+    zeros, ones = np.zeros((len(pos), 3)), np.ones(len(pos))
+    values = {"pos": np.array(pos), "vel": zeros, "ang_vel": zeros, "radius": scenes.RADIUS_M * ones}
+    return Start(**(values | {"active": ones.astype(bool)} | changes))
 
 
 class TestWithoutYade:

@@ -1,23 +1,28 @@
 """Initial states: without overlap, clear of the walls, reproducible, and refused when the grains do not fit."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
+import trimesh
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy.spatial import cKDTree
-from scipy.spatial.distance import pdist
+from scipy.spatial.distance import pdist, squareform
 
 from data_gen.initial import initial_state
 from gns_pyg.errors import GeometryError
+from gns_pyg.scene.inlet import entries
 from gns_pyg.scene.mesh import build_mesh, distance, inside
-from gns_pyg.scene.scene import Scene
+from gns_pyg.scene.scene import Inlet, Outlet, Scene
 from tests import scenes
 
 HOPPER = {"kind": "revolution", "profile_m": [[0.1, 0.0], [0.05, 0.1], [0.1, 0.2], [0.1, 0.4]], "segments": 16}
 DRUM = {"kind": "cylinder", "radius_m": 0.1, "length_m": 0.15, "axis": [1.0, 0.0, 0.0], "segments": 24}
+FLOOR = {"kind": "floor", "size_m": [1.0, 1.0]}
 
 
-def make(arrangement: str, count: int = 60, seed: int = 0, shape: dict = HOPPER, **limits: float):
+def make(arrangement: str, count: int = 60, seed: int = 0, shape: dict = HOPPER, **limits):
     scene = scenes.scene(
         count,
         2,
@@ -91,8 +96,69 @@ def test_too_many_grains_are_refused_with_a_remedy(arguments, told) -> None:
         initial_state(*make(**arguments), 0)
 
 
-def test_grains_need_a_closed_part() -> None:
-    scene, meshes = make("random")
-    meshes["walls"].update_faces(np.arange(len(meshes["walls"].faces)) > 0)
-    with pytest.raises(GeometryError, match="3 open edges"):
+@pytest.mark.parametrize("region", [{}, {"region_m": [[-0.2, -0.2, -0.2], [0.2, 0.2, 0.2]]}])
+def test_a_mesh_file_with_a_hole_is_refused(region, tmp_path) -> None:
+    box = trimesh.creation.box([1.0, 1.0, 1.0])
+    box.update_faces(np.arange(len(box.faces)) > 0)
+    box.export(tmp_path / "open.stl")
+    scene, meshes = make("random", shape={"kind": "file", "path": str(tmp_path / "open.stl")}, **region)
+    with pytest.raises(GeometryError, match=r"^scene\.boundary\.walls\n[\s\S]*3 open edges[\s\S]*close the holes"):
         initial_state(scene, meshes, 0)
+
+
+@pytest.mark.parametrize("arrangement", ["random", "dense"])
+class TestRegion:
+    def test_a_floor_alone_needs_a_region(self, arrangement) -> None:
+        with pytest.raises(GeometryError, match=r"^scene\.initial\.region_m\n[\s\S]*nothing encloses[\s\S]*walls"):
+            initial_state(*make(arrangement, shape=FLOOR), 0)
+
+    def test_grains_lie_in_the_region_and_above_the_floor(self, arrangement) -> None:
+        region = [[-0.1, -0.1, -0.1], [0.1, 0.1, 0.2]]
+        pos = initial_state(*make(arrangement, shape=FLOOR, region_m=region), 0).pos
+        assert (np.abs(pos[:, :2]) <= 0.1).all()
+        assert (np.abs(pos[:, 2]) >= scenes.RADIUS_M).all()
+
+    def test_a_region_narrows_what_encloses_grains(self, arrangement) -> None:
+        region = [[-1.0, -1.0, 0.2], [0.0, 1.0, 1.0]]
+        scene, meshes = make(arrangement, region_m=region)
+        pos = initial_state(scene, meshes, 0).pos
+        assert clear(scene, meshes, pos)
+        assert pos[:, 0].max() <= 0
+        assert pos[:, 2].min() >= 0.2
+
+    def test_no_grain_starts_beyond_the_outlet(self, arrangement) -> None:
+        scene, meshes = make(arrangement)
+        scene = replace(scene, outlet=Outlet([0.0, 0.0, 0.25], [0.0, 0.0, -2.0]))
+        assert initial_state(scene, meshes, 0).pos[:, 2].min() >= 0.25
+
+
+@settings(max_examples=10, deadline=None)
+@given(
+    arrangement=st.sampled_from(["random", "dense"]),
+    share=st.sampled_from([[], [0.5, 0.5], [0.1, 0.9], [0.25, 0.75]]),
+    case=st.integers(0, 50),
+)
+def test_several_radii_do_not_overlap_are_as_many_as_their_share_says_and_are_shuffled(
+    arrangement, share, case
+) -> None:
+    scene, meshes = make(arrangement)
+    scene = replace(scene, grains=replace(scene.grains, radius_m=[0.01, 0.006], share=share))
+    start = initial_state(scene, meshes, case)
+    of_each = {radius: int((start.radius == radius).sum()) for radius in (0.01, 0.006)}
+    assert of_each == dict(scene.grains.counts)
+    assert of_each[0.01] == pytest.approx(60 * (share or [0.5])[0], abs=1)
+    touching = start.radius[:, None] + start.radius
+    assert (pdist(start.pos) >= squareform(touching, checks=False)).all()
+    walls = meshes["walls"]
+    assert (distance(walls, start.pos) >= start.radius).all()
+    assert not np.array_equal(start.radius, np.sort(start.radius)[::-1])
+    assert not np.array_equal(start.radius, initial_state(scene, meshes, case + 1).radius)
+
+
+def test_grains_that_enter_later_wait_where_they_will_enter() -> None:
+    scene, meshes = make("random")
+    scene = replace(scene, inlet=Inlet(20, 100.0, [0.0, 0.0, 0.39], [0.1, 0.1], [0.0, 0.0, -1.0]))
+    start = initial_state(scene, meshes, 0)
+    assert start.active.tolist() == [True] * 40 + [False] * 20
+    assert (start.pos[40:] == entries(scene).pos).all()
+    assert not start.vel[40:].any()

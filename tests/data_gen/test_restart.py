@@ -111,7 +111,8 @@ def rolling(tmp_path_factory) -> Path:
     pos = np.array([[0.0, 0.0, 0.01], [-0.012, 0.0, 0.1], [0.012, 0.002, 0.1]])
     vel = np.array([[0.0, 0.0, 0.0], [0.5, 0.0, 0.0], [-0.5, 0.0, 0.0]])
     ang_vel = np.array([[0.0, 200.0, 0.0], [0.0, 0.0, 0.0], [0.0, 0.0, 0.0]])
-    run_dem(fine, meshes, Start(pos, vel, ang_vel), folder / "case_000.h5", n_frames=6)
+    start = Start(pos, vel, ang_vel, np.full(3, 0.01), np.ones(3, bool))
+    run_dem(fine, meshes, start, folder / "case_000.h5", n_frames=6)
     return folder
 
 

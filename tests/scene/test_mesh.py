@@ -7,7 +7,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from gns_pyg.errors import ConfigError, GeometryError
-from gns_pyg.scene.mesh import build_mesh, distance, inside, same_mesh
+from gns_pyg.scene.mesh import build_mesh, container, distance, inside, same_mesh
 from gns_pyg.scene.scene import Part
 
 PROFILE = [[0.25, 0.0], [0.25, 0.3], [0.1, 0.45], [0.25, 0.6], [0.25, 0.9]]
@@ -135,13 +135,38 @@ def test_a_mesh_file_is_the_same_body_in_the_unit_that_scale_says(tmp_path, suff
     assert mesh.extents == pytest.approx([0.2, 0.1, 0.05])
 
 
-def test_a_file_wound_inside_out_is_turned(tmp_path) -> None:
+def test_a_file_whose_normals_point_inwards_is_refused(tmp_path) -> None:
     box = trimesh.creation.box([1.0, 1.0, 1.0])
     box.invert()
     box.export(tmp_path / "box.stl")
-    mesh = build_mesh("box", part(kind="file", path=str(tmp_path / "box.stl")))
-    assert mesh.volume > 0
-    assert inside(mesh, np.zeros((1, 3))).all()
+    with pytest.raises(GeometryError, match=r"box\.stl\n[\s\S]*point inwards[\s\S]*flip its normals"):
+        build_mesh("box", part(kind="file", path=str(tmp_path / "box.stl")))
+
+
+def test_the_package_s_own_file_is_found_from_anywhere(tmp_path, monkeypatch) -> None:
+    monkeypatch.chdir(tmp_path)
+    assert build_mesh("silo", part(kind="file", path="conf/scene/silo.stl", scale=0.001)).is_watertight
+
+
+def test_a_floor_is_flat_where_it_is_put_and_faces_up() -> None:
+    floor = part(kind="floor", size_m=[2, 3], center_m=[1, 0, 0.5])
+    mesh = build_mesh("floor", floor)
+    assert mesh.bounds == pytest.approx(np.array([[0.0, -1.5, 0.5], [2.0, 1.5, 0.5]]))
+    assert mesh.face_normals == pytest.approx(np.tile([0.0, 0.0, 1.0], (2, 1)))
+    assert container("floor", floor) is None
+
+
+def test_an_open_bottom_lacks_the_lower_lid_alone_and_faces_the_grains() -> None:
+    shape = {"kind": "revolution", "profile_m": [[0.1, 0.0], [0.2, 0.3]], "segments": 24}
+    closed, opened = (build_mesh("hopper", part(**shape, open_bottom=o)) for o in (False, True))
+    lid = closed.area_faces[(closed.triangles[:, :, 2] == 0).all(axis=1)].sum()
+    assert lid > 0
+    assert opened.area == pytest.approx(closed.area - lid)
+    assert not opened.is_watertight
+    within = opened.triangles_center + 1e-4 * opened.face_normals
+    assert inside(closed, within).all()
+    assert same_mesh({"vertices": closed.vertices, "triangles": closed.faces}, container("hopper", part(**shape)))
+    assert container("hopper", part(**shape, open_bottom=True)).volume == pytest.approx(closed.volume)
 
 
 @pytest.mark.parametrize("closed", [True, False])
@@ -161,6 +186,8 @@ def test_an_open_surface_has_no_inside_and_the_error_counts_its_open_edges(tmp_p
     mesh = build_mesh("box", part(kind="file", path=str(tmp_path / "open.stl")))
     with pytest.raises(GeometryError, match=r"3 open edges[\s\S]*close the holes"):
         inside(mesh, np.zeros((1, 3)))
+    with pytest.raises(GeometryError, match=r"^scene\.boundary\.box\n[\s\S]*3 open edges"):
+        container("box", part(kind="file", path=str(tmp_path / "open.stl")))
 
 
 @pytest.mark.parametrize(
@@ -190,6 +217,9 @@ def test_an_open_surface_has_no_inside_and_the_error_counts_its_open_edges(tmp_p
         ({"kind": "box", "size_m": [1.0, 1.0, np.inf]}, "shape.size_m"),
         ({"kind": "box", "size_m": [1.0, 1.0, 0.0]}, "shape.size_m"),
         ({"kind": "box", "size_m": [1.0, 1.0, 1.0], "center_m": [0, 0, np.nan]}, "shape.center_m"),
+        ({"kind": "floor", "size_m": [1.0]}, "shape.size_m"),
+        ({"kind": "floor", "size_m": [1.0, 0.0]}, "shape.size_m"),
+        ({"kind": "floor", "size_m": [1.0, 1.0], "center_m": [0.0, 0.0]}, "shape.center_m"),
         ({"kind": "file", "path": __file__, "scale": np.inf}, "shape.scale"),
         ({"kind": "file", "path": "nowhere/drum.stl"}, "shape.path"),
     ],

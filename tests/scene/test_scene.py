@@ -102,3 +102,71 @@ def test_a_value_out_of_range_is_refused_by_its_key(key, value) -> None:
 def test_a_part_needs_a_name_that_can_be_a_key(name) -> None:
     with pytest.raises(ConfigError, match="Python identifier"):
         Scene.from_config(changed("boundary", {name: DRUM}))
+
+
+SIZES = GOOD["grains"] | {"radius_m": [0.01, 0.02]}
+INLET = {"count": 2, "rate_per_s": 10, "center_m": [0, 0, 1], "size_m": [0.1, 0.1], "velocity_m_s": [0, 0, -1]}
+
+
+@pytest.mark.parametrize(
+    ("key", "value", "where", "told"),
+    [
+        ("grains", SIZES | {"share": [0.5, 0.6]}, "grains.share", "1 in all"),
+        ("grains", SIZES | {"share": [1.0]}, "grains.share", "each of the 2 radii"),
+        ("grains", SIZES | {"share": [1.5, -0.5]}, "grains.share", "above 0"),
+        ("grains", SIZES | {"radius_m": [0.01, 0.01]}, "grains.radius_m", "share"),
+        ("grains", SIZES | {"radius_m": []}, "grains.radius_m", "above 0"),
+        ("grains", SIZES | {"radius_m": [0.01, "big"]}, "grains.radius_m", "above 0"),
+        ("grains.shape", "clump", "grains.shape", r"sphere[\s\S]*orientation and inertia[\s\S]*use spheres"),
+        ("boundary.drum.motion", {"kind": "rotation", "rate_rad_s": 3}, "boundary.drum.motion.axis", "direction"),
+        ("boundary.drum.motion.speed_m_s", 1, "boundary.drum.motion.speed_m_s", "kind=translation"),
+        ("inlet", {k: v for k, v in INLET.items() if k != "rate_per_s"}, "inlet.rate_per_s", "grains per second"),
+        ("inlet", INLET | {"rate_per_s": 0}, "inlet.rate_per_s", "grains per second"),
+        ("inlet", INLET | {"rate_per_s": np.nan}, "inlet.rate_per_s", "grains per second"),
+        ("inlet", INLET | {"count": 6}, "inlet.count", "at most scene.grains.count = 5"),
+        ("inlet", INLET | {"count": 0}, "inlet.count", "at least 1"),
+        ("inlet", INLET | {"size_m": [0.1]}, "inlet.size_m", "2 finite numbers"),
+        ("inlet", INLET | {"size_m": [0.1, 0]}, "inlet.size_m", "above 0"),
+        ("outlet", {"point_m": [0, 0, 0]}, "outlet.normal", "three finite numbers"),
+        ("outlet", {"point_m": [0, 0, 0], "normal": [0, 0, 0]}, "outlet.normal", "not all 0"),
+        ("outlet", {"normal": [0, 0, -1]}, "outlet.point_m", "three finite numbers"),
+        ("vary", {"colour": [1]}, "vary.colour", "friction_angle_rad or damping"),
+        ("vary", {"damping": []}, "vary.damping", "a list of finite numbers"),
+        ("vary", {"damping": 0.2}, "vary.damping", "a list of finite numbers"),
+        ("vary", {"damping": [0.2, "none"]}, "vary.damping", "a list of finite numbers"),
+        ("vary", {"damping": [0.1, 1.0]}, "vary.damping", "below 1"),
+        ("vary", {"friction_angle_rad": [0.1, 30]}, "grains.material.friction_angle_rad", "below pi/2"),
+        ("initial.region_m", [[0, 0, 1], [1, 1, 0]], "initial.region_m", "the lower and the upper corner"),
+        ("initial.region_m", [[0, 0, 1]], "initial.region_m", "the lower and the upper corner"),
+        ("initial.region_m", [[0, 0], [1, 1]], "initial.region_m", "the lower and the upper corner"),
+        ("initial.region_m", [0, 1], "initial.region_m", "the lower and the upper corner"),
+    ],
+)
+def test_what_makes_no_sense_is_refused_by_its_key_with_a_remedy(key, value, where, told) -> None:
+    with pytest.raises(ConfigError, match=rf"^scene\.{where}\n[\s\S]*{told}"):
+        Scene.from_config(changed(key, value))
+
+
+@pytest.mark.parametrize("key", ["outlet", "inlet"])
+def test_a_misspelt_key_is_refused_with_the_known_ones(key) -> None:
+    with pytest.raises(ConfigError, match=rf"^scene\.{key}\.colour\n"):
+        Scene.from_config(changed(key, {"colour": 1}))
+
+
+def test_every_case_has_its_own_value_of_what_varies() -> None:
+    scene = Scene.from_config(changed("vary", {"friction_angle_rad": [0.1, 0.2, 0.3], "damping": [0, 0.4]}))
+    assert [scene.of_case(case).grains.material.friction_angle_rad for case in range(4)] == [0.1, 0.2, 0.3, 0.1]
+    assert [scene.of_case(case).damping for case in range(4)] == [0.0, 0.4, 0.0, 0.4]
+    assert scene.of_case(1).parameters == scene.parameters | {"friction_angle_rad": 0.2, "damping": 0.4}
+    again = Scene.from_config(asdict(scene.of_case(1)))
+    assert again == scene.of_case(1)
+
+
+@pytest.mark.parametrize("share", [[], [0.5, 0.5], [0.9, 0.1], [1 / 3, 2 / 3]])
+@pytest.mark.parametrize("count", [1, 2, 7, 100])
+def test_the_counts_of_all_radii_add_up(share, count) -> None:
+    grains = Scene.from_config(changed("grains", SIZES | {"share": share, "count": count})).grains
+    assert sum(n for _, n in grains.counts) == count
+    for (radius, n), part in zip(grains.counts, share or [0.5, 0.5], strict=True):
+        assert radius in grains.radii_m
+        assert abs(n - part * count) <= 1
