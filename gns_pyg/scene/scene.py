@@ -368,7 +368,7 @@ class Scene:
             listed = isinstance(values, list) and bool(values) and finite(values, len(values))
             require(listed, f"scene.vary.{name}", values, "a list of finite numbers", "e.g. [0.3, 0.5, 0.7]")
             for case in range(len(values)):
-                self._with({name: values[case]})
+                self._with({name: float(values[case])})
 
     def of_case(self, case: int) -> "Scene":
         """The scene of case number `case`: parameters that vary have that case's values.
@@ -376,7 +376,7 @@ class Scene:
         Raises:
             ConfigError: for a value out of range.
         """
-        return self._with({name: values[case % len(values)] for name, values in self.vary.items()})
+        return self._with({name: float(values[case % len(values)]) for name, values in self.vary.items()})
 
     def _with(self, values: dict[str, float]) -> "Scene":
         ours = {name: value for name, value in values.items() if name == "damping"}

@@ -1,19 +1,24 @@
 """Scenes: every value out of range is refused by its key, every scene of the package is accepted."""
 
+import re
 from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
+import yaml
 from hydra import compose, initialize_config_dir
 
 import gns_pyg
 from gns_pyg.errors import ConfigError
+from gns_pyg.scene.inlet import entries
+from gns_pyg.scene.mesh import build_mesh
 from gns_pyg.scene.scene import Scene
 from tests import scenes
 
 CONF = Path(gns_pyg.__file__).parent / "conf"
+ROOT = Path(__file__).parents[2]
 DRUM: dict[str, Any] = {
     "shape": {"kind": "cylinder", "radius_m": 1, "length_m": 1},
     "points": 10,
@@ -170,3 +175,24 @@ def test_the_counts_of_all_radii_add_up(share, count) -> None:
     for (radius, n), part in zip(grains.counts, share or [0.5, 0.5], strict=True):
         assert radius in grains.radii_m
         assert abs(n - part * count) <= 1
+
+
+def examples() -> list[str]:
+    """YAML of docs/scenes.md: whole blocks, or one line each where a block holds alternatives."""
+    blocks = re.findall(r"```yaml\n(.*?)```", (ROOT / "docs" / "scenes.md").read_text(), re.DOTALL)
+    alternatives = ("shape:", "motion:")
+    return [text for block in blocks for text in (block.splitlines() if block.startswith(alternatives) else [block])]
+
+
+@pytest.mark.parametrize("text", examples())
+def test_the_examples_of_the_documentation_are_true(text, monkeypatch) -> None:
+    monkeypatch.chdir(CONF / "scene")  # where silo.stl lies
+    ((key, value),) = yaml.safe_load(text).items()
+    if key in ("shape", "motion"):
+        key = f"boundary.drum.{key}"
+    elif isinstance(GOOD[key], dict) and key != "boundary":
+        value = GOOD[key] | value
+    scene = Scene.from_config(changed("grains.count", 100) | {key: value} if "." not in key else changed(key, value))
+    entries(scene)
+    for name, part in scene.boundary.items():
+        build_mesh(name, part)
