@@ -122,6 +122,7 @@ class File:
             raise GeometryError(path, "no triangles", "a triangle mesh", "export it again, e.g. as binary STL")
         mesh.merge_vertices(merge_tex=True, merge_norm=True)  # STL repeats corners; only joined ones can be closed
         mesh.update_faces(mesh.nondegenerate_faces())
+        mesh.metadata["path"] = str(path)  # so that a later error can name it
         if not mesh.is_winding_consistent:
             raise GeometryError(
                 path,
@@ -182,14 +183,15 @@ def container(name: str, part: Part) -> Trimesh | None:
 
 
 def require_closed(mesh: Trimesh, where: str) -> None:
-    """Raises GeometryError unless `mesh` encloses a volume; says how many edges are open."""
+    """Raises GeometryError unless `mesh` encloses a volume; names its file and says how many edges are open."""
     if mesh.is_watertight:
         return
+    file = f"{mesh.metadata['path']}: " if "path" in mesh.metadata else ""
     n_triangles_at_edge = np.unique(mesh.edges_sorted, axis=0, return_counts=True)[1]
     raise GeometryError(
         where,
-        f"{(n_triangles_at_edge == 1).sum()} open edges and {(n_triangles_at_edge > 2).sum()} edges with more than two "
-        f"triangles, of {len(n_triangles_at_edge)}",
+        f"{file}{(n_triangles_at_edge == 1).sum()} open edges and {(n_triangles_at_edge > 2).sum()} edges with more than "
+        f"two triangles, of {len(n_triangles_at_edge)}",
         "a closed surface, so that inside and outside are defined",
         "close the holes (e.g. mesh.fill_holes() of trimesh, or in the CAD program) and export it again; "
         "open parts made of files are not supported as containers yet",

@@ -186,7 +186,7 @@ def test_an_open_surface_has_no_inside_and_the_error_counts_its_open_edges(tmp_p
     mesh = build_mesh("box", part(kind="file", path=str(tmp_path / "open.stl")))
     with pytest.raises(GeometryError, match=r"3 open edges[\s\S]*close the holes"):
         inside(mesh, np.zeros((1, 3)))
-    with pytest.raises(GeometryError, match=r"^scene\.boundary\.box\n[\s\S]*3 open edges"):
+    with pytest.raises(GeometryError, match=r"^scene\.boundary\.box\n[\s\S]*open\.stl: 3 open edges"):
         container("box", part(kind="file", path=str(tmp_path / "open.stl")))
 
 
