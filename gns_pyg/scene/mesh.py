@@ -190,8 +190,8 @@ def require_closed(mesh: Trimesh, where: str) -> None:
     n_triangles_at_edge = np.unique(mesh.edges_sorted, axis=0, return_counts=True)[1]
     raise GeometryError(
         where,
-        f"{file}{(n_triangles_at_edge == 1).sum()} open edges and {(n_triangles_at_edge > 2).sum()} edges with more than "
-        f"two triangles, of {len(n_triangles_at_edge)}",
+        f"{file}{(n_triangles_at_edge == 1).sum()} open edges and {(n_triangles_at_edge > 2).sum()} edges with more "
+        f"than two triangles, of {len(n_triangles_at_edge)}",
         "a closed surface, so that inside and outside are defined",
         "close the holes (e.g. mesh.fill_holes() of trimesh, or in the CAD program) and export it again; "
         "open parts made of files are not supported as containers yet",
