@@ -1,7 +1,8 @@
 """Trained bundles taken to scenes they have not seen, without training: `python benchmarks/transfer.py`.
 
-Trains a bundle per scene with the default training (kept in runs/transfer/<scene>), evaluates it on its own unseen cases
-and on real Yade runs of changed scenes (made as docs/requirements.md says), and writes benchmarks/results/transfer.json.
+Trains a bundle per scene with the default training (kept in runs/transfer/<scene>), evaluates it on its own unseen
+cases and on real Yade runs of changed scenes (docs/requirements.md says how to make them), and writes
+benchmarks/results/transfer.json.
 """
 
 import json
