@@ -24,12 +24,13 @@ def can_touch(state: State, free_pos: Float[Tensor, "n_grains 3"], graph: Graph,
     """
     touches = torch.zeros(len(state.pos), dtype=torch.bool, device=state.pos.device)
     way = free_pos - state.pos
-    sender, receiver = graph.grain_edges
-    rel_pos = state.pos[sender] - state.pos[receiver]
+    sender, receiver = pairs = graph.grain_edges[:, graph.grain_edges[0] <= graph.grain_edges[1]]  # once is enough
+    where = torch.cat([state.pos, way], dim=1)
+    rel_pos, rel_way = (where[sender] - where[receiver]).split(3, dim=1)
     distance = torch.linalg.vector_norm(rel_pos, dim=1)
     reach = state.radius[sender] + state.radius[receiver]
-    closing = ((way[receiver] - way[sender]) * rel_pos).sum(1) / distance.clamp(min=1e-9)
-    touches[receiver[distance - reach <= closing.clamp(min=0) + MARGIN_RADII * reach / 2]] = True
+    closing = -(rel_way * rel_pos).sum(1) / distance.clamp(min=1e-9)
+    touches[pairs[:, distance - reach <= closing.clamp(min=0) + MARGIN_RADII * reach / 2]] = True
     if graph.walls is not None:
         point, grain = graph.wall_edges
         normal, radius = graph.walls.normal[point], state.radius[grain]
