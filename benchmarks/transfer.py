@@ -1,4 +1,4 @@
-"""Trained bundles taken to scenes they have not seen, without training: `python benchmarks/transfer.py`.
+"""Trained bundles taken to scenes they have not seen, without training: `python -m benchmarks.transfer`.
 
 Trains a bundle per scene with the default training (kept in runs/transfer/<scene>), evaluates it on its own unseen
 cases and on real Yade runs of changed scenes (docs/requirements.md says how to make them), and writes

@@ -16,7 +16,7 @@ from gns_pyg.data.trajectory import Trajectory
 from gns_pyg.data.windows import UpdateSampler, Windows
 from gns_pyg.errors import ConfigError, DataError
 from gns_pyg.scene.containment import outside
-from gns_pyg.scene.mesh import build_mesh, require_closed, same_mesh
+from gns_pyg.scene.mesh import build_mesh, same_mesh
 from gns_pyg.scene.scene import Scene
 from gns_pyg.state import Window
 
@@ -151,17 +151,14 @@ def check_same_scene(trajectory: Trajectory, scene: Scene) -> None:
 
 
 def check_inside(trajectory: Trajectory, scene: Scene) -> None:
-    """Checks that every grain of a case starts inside the boundary.
+    """Checks that every grain that is there starts inside the boundary.
 
     Raises:
         GeometryError: for a part made of a mesh file that is not closed: it has no inside.
         DataError: if grains are outside; names the first.
     """
-    for name, part in scene.boundary.items():
-        if part.shape.get("kind") == "file":
-            require_closed(build_mesh(name, part), f"scene.boundary.{name}")
     first = trajectory.read("position", 0, 1)
-    out = np.flatnonzero(outside(first, trajectory.times_s[:1], scene)[0])
+    out = np.flatnonzero(outside(first, trajectory.times_s[:1], scene)[0] & trajectory.active(0, 1)[0])
     if len(out):
         raise DataError(
             trajectory.path,

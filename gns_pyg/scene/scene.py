@@ -361,6 +361,11 @@ class Scene:
         if self.angle_of_repose is not None:
             self.angle_of_repose.check("scene.angle_of_repose")
         if self.inlet is not None:
+            if self.outlet is not None:
+                arm = [a - b for a, b in zip(self.inlet.center_m, self.outlet.point_m, strict=True)]
+                before = sum(a * b for a, b in zip(arm, self.outlet.normal, strict=True)) <= 0
+                where, remedy = "scene.inlet.center_m", "move the inlet, or turn scene.outlet.normal"
+                require(before, where, self.inlet.center_m, "a place that is not beyond the outlet", remedy)
             key, n = "scene.inlet.count", self.inlet.count
             require(n <= self.grains.count, key, n, f"at most scene.grains.count = {self.grains.count}", "lower it")
         for name, values in self.vary.items():

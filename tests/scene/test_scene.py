@@ -196,3 +196,9 @@ def test_the_examples_of_the_documentation_are_true(text, monkeypatch) -> None:
     entries(scene)
     for name, part in scene.boundary.items():
         build_mesh(name, part)
+
+
+def test_grains_cannot_enter_beyond_the_outlet() -> None:
+    outlet = {"point_m": [0, 0, 2], "normal": [0, 0, -1]}
+    with pytest.raises(ConfigError, match="not beyond the outlet"):
+        scenes.scene(5, 5, inlet=INLET, outlet=outlet)
