@@ -5,7 +5,7 @@ from jaxtyping import Float, Int
 from torch import Tensor, nn
 
 from gns_pyg.models.interaction import Interaction
-from gns_pyg.models.mlp import mlp
+from gns_pyg.models.mlp import in_blocks, mlp
 
 
 class ContactNetwork(nn.Module):
@@ -69,7 +69,7 @@ class ContactNetwork(nn.Module):
             senders = self.encode_sender(sender_features[reaching])
         else:
             senders, sender = self.encode_sender(sender_features), edge_index[0]
-        edges, compact = self.encode_edge(edge_features), torch.stack([sender, receiver])
+        edges, compact = in_blocks(self.encode_edge, edge_features), torch.stack([sender, receiver])
         for interaction in self.interactions:
             receivers, edges = interaction(receivers if senders is None else senders, receivers, edges, compact)
         effect = self.decode(receivers)

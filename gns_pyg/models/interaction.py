@@ -5,7 +5,7 @@ from jaxtyping import Float, Int
 from torch import Tensor, nn
 from torch_geometric.nn import MessagePassing
 
-from gns_pyg.models.mlp import mlp
+from gns_pyg.models.mlp import BLOCK, blocks_pay, mlp
 
 
 class Interaction(MessagePassing):
@@ -44,12 +44,25 @@ class Interaction(MessagePassing):
     ) -> tuple[Float[Tensor, "n_receivers hidden"], Float[Tensor, "n_edges hidden"]]:
         size = (senders.shape[0], receivers.shape[0])
         nodes = (self.from_sender(senders), self.from_receiver(receivers))
-        messages = self.edge_updater(edge_index, x=nodes, edge=self.from_edge(edges), size=size)
-        received = self.propagate(edge_index, messages=messages, size=size)
+        if blocks_pay(edges):
+            received, edges = self._in_blocks(nodes, edges, edge_index)
+        else:
+            messages = self.edge_updater(edge_index, x=nodes, edge=self.from_edge(edges), size=size)
+            received = self.propagate(edge_index, messages=messages, size=size)
+            edges = edges + messages if self.skip else messages
         updated = self.update_mlp(torch.cat([receivers, received], dim=1))
-        if self.skip:
-            return receivers + updated, edges + messages
-        return updated, messages
+        return receivers + updated if self.skip else updated, edges
+
+    def _in_blocks(self, nodes: tuple[Tensor, Tensor], edges: Tensor, edge_index: Tensor) -> tuple[Tensor, Tensor]:
+        """What receivers are sent and the new edges; a block of edges goes through all layers while it is in cache."""
+        received, after = torch.zeros_like(nodes[1]), torch.empty_like(edges)
+        for start in range(0, len(edges), BLOCK):
+            block = slice(start, start + BLOCK)
+            sender, receiver = edge_index[:, block]
+            messages = self.edge_update(nodes[0][sender], nodes[1][receiver], self.from_edge(edges[block]))
+            received.index_add_(0, receiver, messages)
+            after[block] = edges[block] + messages if self.skip else messages
+        return received, after
 
     def edge_update(self, x_j: Tensor, x_i: Tensor, edge: Tensor) -> Tensor:
         return self.message_mlp(torch.relu(x_i + x_j + edge))

@@ -64,3 +64,21 @@ def test_edges_carry_from_sender_to_receiver():
     points[0] += 1
     changed = (model(points, grains, edges, edge_index) != before).any(dim=1)
     assert changed.tolist() == [False, False, True]
+
+
+@pytest.mark.parametrize("skip", [True, False])
+@pytest.mark.parametrize("n_sender", [None, 4])
+def test_blocks_without_gradients_are_the_plain_network(skip, n_sender, monkeypatch):
+    monkeypatch.setattr("gns_pyg.models.mlp.BLOCK", 16)
+    monkeypatch.setattr("gns_pyg.models.interaction.BLOCK", 16)
+    random = torch.Generator().manual_seed(1)
+    model = network(skip=skip, n_sender=n_sender)
+    grains, edges = torch.randn(12, 3, generator=random), torch.randn(90, 2, generator=random)
+    pairs = torch.randint(0, 11, (2, 45), generator=random)
+    edge_index = torch.cat([pairs, pairs.flip(0)], dim=1)
+    senders = None if n_sender is None else torch.randn(12, 4, generator=random)
+    plain = model(senders, grains, edges, edge_index)
+    with torch.inference_mode():
+        blocked = model(senders, grains, edges, edge_index)
+    assert plain.requires_grad
+    assert torch.allclose(plain, blocked, rtol=1e-5, atol=1e-6)
