@@ -208,7 +208,7 @@ def test_the_command_line_ends_with_a_message_and_status_1(tmp_path):
 def test_a_bundle_of_another_format_version_is_refused(trained, tmp_path):
     shutil.copytree(trained[0] / "bundle", tmp_path / "bundle")
     path = tmp_path / "bundle" / "bundle.json"
-    path.write_text(path.read_text().replace('"format_version": 1', '"format_version": 99'))
+    path.write_text(path.read_text().replace(f'"format_version": {bundle.FORMAT_VERSION}', '"format_version": 99'))
     with pytest.raises(BundleError, match="format version 99"):
         bundle.load(tmp_path / "bundle")
 
