@@ -41,8 +41,7 @@ def main() -> None:
     rows = []
     for scene, changes in CHANGES.items():
         folder = Path("runs/transfer") / scene
-        if not (folder / "bundle" / "bundle.json").exists():
-            run.train(config("train", f"scene={scene}", "callbacks.rollout_metrics=null", f"folder={folder}"))
+        run.train(config("train", f"scene={scene}", "callbacks.rollout_metrics=null", f"folder={folder}"))
         own = run.evaluate(config("evaluate", f"bundle={folder}/bundle", f"folder={folder}/own"))
         rows.append({"scene": scene, "change": "none", "metrics": own})
         for change, (cases, overrides) in changes.items():

@@ -24,13 +24,7 @@ from gns_pyg.errors import DataError, GnsError
 from gns_pyg.scene.mesh import build_mesh, same_mesh
 from gns_pyg.scene.scene import Scene
 
-READ_LATER = (
-    "cases",
-    "angle_of_repose",
-    "points",
-    "state",
-    "vary",
-)  # keys of a scene that do not influence its DEM run
+READ_LATER = ("cases", "angle_of_repose", "state", "vary")  # keys that do not influence a DEM run; nor do points
 
 
 def generate(config: DictConfig) -> Path:
@@ -73,7 +67,8 @@ def check_finished(path: Path, scene: Scene, meshes: Mapping[str, Trimesh]) -> s
         for key in sorted({*stored, *wanted})
         if stored.get(key) != wanted.get(key)
     }
-    serious = [text for key, text in differences.items() if not set(READ_LATER) & set(key.split("."))]
+    later = {key for key in differences if key.split(".")[0] in READ_LATER or key.endswith(".points")}
+    serious = [text for key, text in differences.items() if key not in later]
     for name, part in trajectory.boundary.items():
         if name in meshes and not same_mesh(part, meshes[name]):  # a mesh file can change behind an equal path
             serious.append(f"boundary.{name}: another mesh than the file's")

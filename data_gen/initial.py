@@ -55,7 +55,7 @@ def initial_state(scene: Scene, meshes: Mapping[str, Trimesh], case: int) -> Sta
         radius = generator.permutation(radius)
     n = scene.grains.count - len(later.pos)
     arrange = {"random": _random, "dense": _dense}[scene.initial.arrangement]
-    pos = arrange(scene, meshes, radius[:n], generator)
+    pos = arrange(scene, meshes, radius[:n], generator) if n else np.zeros((0, 3))
     speed = scene.initial.speed_max_m_s
     vel = np.concatenate([generator.uniform(-speed, speed, pos.shape), np.zeros_like(later.pos)])
     pos = np.concatenate([pos, later.pos])

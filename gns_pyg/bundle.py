@@ -4,7 +4,7 @@ import json
 import os
 import shutil
 from collections.abc import Mapping
-from dataclasses import asdict
+from dataclasses import asdict, replace
 from pathlib import Path
 from typing import Any
 
@@ -100,6 +100,7 @@ def load(folder: str | Path, scene: Scene | None = None) -> Simulator:
             }
         else:
             check_covers(requires, scene)
+            requires = replace(requires, active_mask=scene.outlet is not None or scene.inlet is not None)
             points = boundary_points(scene, model.cutoff_wall_radii)
             weights = {key: value for key, value in weights.items() if not key.startswith("boundary.")}
         statistics = typed(Statistics, description.get("statistics"), "statistics")

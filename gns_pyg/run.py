@@ -77,6 +77,8 @@ def train(cfg: DictConfig) -> dict[str, Any]:
     used = cases.describe()
     identity = flat({"model": asdict(model), "training": asdict(training), "cases": used})
     identity |= {f"requires.{row}": value for row, value in asdict(requires).items() if row != "reasons"}
+    identity |= {f"scene.boundary.{name}.points": part.points for name, part in scene.boundary.items()}
+    identity["scene.seed"] = scene.seed  # of the boundary points
     del identity["training.updates"]  # a run may be lengthened
     module = TrainingModule(simulator, training, identity)
     trainer = build_trainer(cfg, training, where)

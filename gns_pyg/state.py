@@ -117,7 +117,7 @@ class Walls(Record):
     Attributes:
         pos: boundary points, m, float64.
         normal: unit normals that point to the grains' side.
-        vel: velocity of the wall at the point, m/s.
+        vel: mean velocity of the point over the coming frame, m/s; where a wall will be is known.
         friction_angle: of the wall at the point, rad.
     """
 

@@ -37,6 +37,7 @@ PAPER = {
 STATISTICS = dict(
     velocity_m_s=0.5,
     spin_rad_s=20.0,
+    radius_m=0.01,
     position_mean_m=[0.0, 0.0, 0.1],
     position_std_m=0.1,
     parameters_mean=[1000.0, 1e6, 0.25, 0.5, 0.1],

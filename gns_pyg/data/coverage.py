@@ -30,6 +30,8 @@ def coverage(scene: Scene, trajectories: Sequence[Trajectory], frames: slice = s
         frames: frames whose speeds count.
     """
     ranges = {name: [found[0], found[-1]] for name, found in values(trajectories).items()}
+    if walls := [part.friction_angle_rad for part in scene.boundary.values()]:
+        ranges["wall friction angle, rad"] = [min(walls), max(walls)]
     ranges["grain radius, m"] = [scene.grains.radii_m[0], scene.grains.radii_m[-1]]
     strength = float(np.linalg.norm(scene.gravity_m_s2))
     ranges["gravity, m/s^2"] = [strength] * 2
@@ -47,6 +49,9 @@ def outside_coverage(trained: Mapping[str, Sequence[float]], now: Mapping[str, S
     """One sentence for every range of `now` that leaves that of `trained`."""
     texts = []
     for name, (low, high) in now.items():
+        if name not in trained:
+            texts.append(f"{name}: {high:.4g}; the model has seen none")
+            continue
         lowest, highest = trained[name]
         slack = SLACK * max(abs(lowest), abs(highest)) + 1e-9
         too_high = high > (ROOM * highest + 1e-9 if name in SPEEDS else highest + slack)

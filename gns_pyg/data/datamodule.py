@@ -151,14 +151,16 @@ def check_same_scene(trajectory: Trajectory, scene: Scene) -> None:
 
 
 def check_inside(trajectory: Trajectory, scene: Scene) -> None:
-    """Checks that every grain that is there starts inside the boundary.
+    """Checks that every grain starts inside the boundary, those that enter later too.
 
     Raises:
         GeometryError: for a part made of a mesh file that is not closed: it has no inside.
         DataError: if grains are outside; names the first.
     """
     first = trajectory.read("position", 0, 1)
-    out = np.flatnonzero(outside(first, trajectory.times_s[:1], scene)[0] & trajectory.active(0, 1)[0])
+    there = trajectory.active(0, 1)[0]
+    there[scene.grains.count - (scene.inlet.count if scene.inlet else 0) :] = True
+    out = np.flatnonzero(outside(first, trajectory.times_s[:1], scene)[0] & there)
     if len(out):
         raise DataError(
             trajectory.path,

@@ -34,6 +34,7 @@ def measure(trajectories: Sequence[Trajectory], integrator: Integrator) -> Stati
     return Statistics(
         velocity_m_s=_root(velocity),
         spin_rad_s=max(_root(spin), 1e-12),
+        radius_m=float(max(trajectory.radius.max() for trajectory in trajectories)),
         correction=torch.stack(corrections).mean(0).sqrt().tolist(),
         position_mean_m=everywhere.mean(0).tolist(),
         position_std_m=float((everywhere - everywhere.mean(0)).square().mean().sqrt()),

@@ -21,6 +21,7 @@ class BoundaryPart(nn.Module):
     Args:
         points: boundary points at t = 0.
         part: gives the rigid motion and the friction angle.
+        dt_s: frame, s.
         neighbors: search backend (see `graph.neighbors`).
         static: build the search structure once; else at every search (only to measure what that costs).
     """
@@ -28,8 +29,9 @@ class BoundaryPart(nn.Module):
     pos: Tensor
     normal: Tensor
 
-    def __init__(self, points: BoundaryPoints, part: Part, neighbors: str, *, static: bool) -> None:
+    def __init__(self, points: BoundaryPoints, part: Part, dt_s: float, neighbors: str, *, static: bool) -> None:
         super().__init__()
+        self.dt_s = dt_s
         self.motion, self.friction_angle_rad = part.motion, part.friction_angle_rad
         self.neighbors, self.static = neighbors, static
         self.register_buffer("pos", torch.as_tensor(points.pos, dtype=torch.float64))
@@ -44,10 +46,11 @@ class BoundaryPart(nn.Module):
         return self
 
     def at(self, rows: Int[Tensor, " n"], time_s: Float[Tensor, " n"]) -> Walls:
-        """Points `rows` in the world, each at its own time."""
+        """Points `rows` in the world, each at its own time, and how fast they move in the frame from then on."""
         pos, vel = to_world(self.motion, self.pos[rows], time_s)
         normal = self.normal[rows]
         if self.motion.moves:
+            vel = (to_world(self.motion, self.pos[rows], time_s + self.dt_s)[0] - pos) / self.dt_s
             normal = torch.einsum("nij,nj->ni", rotation(self.motion, time_s), normal)
         return Walls(pos, normal, vel, torch.full_like(time_s, self.friction_angle_rad))
 
@@ -81,7 +84,8 @@ class Boundary(nn.Module):
     ) -> None:
         super().__init__()
         self.parts = nn.ModuleList(
-            BoundaryPart(points[name], part, neighbors, static=static) for name, part in scene.boundary.items()
+            BoundaryPart(points[name], part, scene.frame_dt_s, neighbors, static=static)
+            for name, part in scene.boundary.items()
         )
         self.reachable = reachable
 

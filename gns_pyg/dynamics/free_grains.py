@@ -24,7 +24,7 @@ def can_touch(state: State, free_pos: Float[Tensor, "n_grains 3"], graph: Graph,
     """
     touches = torch.zeros(len(state.pos), dtype=torch.bool, device=state.pos.device)
     way = free_pos - state.pos
-    sender, receiver = pairs = graph.grain_edges[:, graph.grain_edges[0] <= graph.grain_edges[1]]  # once is enough
+    sender, receiver = pairs = graph.grain_edges[:, graph.grain_edges[0] < graph.grain_edges[1]]  # once is enough
     where = torch.cat([state.pos, way], dim=1)
     rel_pos, rel_way = (where[sender] - where[receiver]).split(3, dim=1)
     distance = torch.linalg.vector_norm(rel_pos, dim=1)

@@ -13,8 +13,7 @@ from torch import Tensor
 
 from gns_pyg.config import require
 from gns_pyg.scene.free_flight import free_flight
-from gns_pyg.scene.requirements import STATES
-from gns_pyg.scene.scene import PARAMETERS, Scene
+from gns_pyg.scene.scene import PARAMETERS, STATES, Scene
 from gns_pyg.state import State, Window
 
 

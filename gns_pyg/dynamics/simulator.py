@@ -131,7 +131,7 @@ class Simulator(nn.Module):
         if state.ang_vel is not None:
             columns.append(state.ang_vel / self.statistics.spin_rad_s)
         if self.requires.radius_features:
-            columns.append(state.radius[:, None] / self.scene.grains.radii_m[-1])
+            columns.append(state.radius[:, None] / self.statistics.radius_m)
         if self._conditions and state.parameters is not None:
             mean, std = (
                 state.pos.new_tensor(v) for v in (self.statistics.parameters_mean, self.statistics.parameters_std)

@@ -12,6 +12,7 @@ class Statistics:
     Attributes:
         velocity_m_s: of a velocity component.
         spin_rad_s: of an angular velocity component.
+        radius_m: the largest grain radius.
         correction: of each group of targets (see `dynamics.integrator`): m/s, m/s, rad/s.
         position_mean_m, position_std_m: of grain centres; used only by models that see absolute position.
         parameters_mean, parameters_std: over the cases, in the order of `scene.PARAMETERS`; 1 where none varies.
@@ -19,6 +20,7 @@ class Statistics:
 
     velocity_m_s: float
     spin_rad_s: float
+    radius_m: float
     correction: list[float]
     position_mean_m: list[float]
     position_std_m: float

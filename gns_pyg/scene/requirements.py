@@ -10,10 +10,8 @@ from typing import Any, Union
 
 from gns_pyg.config import require
 from gns_pyg.errors import ConfigError
-from gns_pyg.scene.scene import PARAMETERS, Scene
+from gns_pyg.scene.scene import PARAMETERS, STATES, Scene
 from gns_pyg.scene.symmetry import symmetry
-
-STATES = ("differences", "velocity", "full")
 
 
 @dataclass
@@ -114,6 +112,11 @@ def resolve(scene: Scene, parameters: Mapping[str, Sequence[float]], requires: R
         rows[row], reasons[row] = forced, f"forced; {reason}"
     if not isinstance(rows["material_features"], list):
         rows["material_features"] = list(PARAMETERS) if rows["material_features"] else []
+    if requires.free_grains == "auto":
+        rows["free_grains"] = rows["free_flight"]
+    for row in ("wall_velocity", "wall_friction", "static_walls", "reachable_points"):
+        carried = rows["wall_network"] or not rows[row]
+        require(carried, f"requires.{row}", "true", "a wall network to carry it", "set requires.wall_network=true too")
     flies = rows["free_flight"] or not rows["free_grains"]
     law = "grains that the networks leave out follow the free-flight law"
     require(flies, "requires.free_grains", "true without requires.free_flight", law, "set requires.free_grains=false")
@@ -130,7 +133,7 @@ def check_covers(trained: Requirements, scene: Scene) -> None:
         ConfigError: if it lacks something; names it.
     """
     needed = _derive(scene, {})
-    for row in LOST:
+    for row in ("wall_network", "wall_velocity"):
         has = getattr(trained, row) or not needed[row][0]
         remedy = f"{LOST[row]}: train on a scene that has it"
         require(has, f"requires.{row}", "false in the bundle", f"true: {needed[row][1]}", remedy)

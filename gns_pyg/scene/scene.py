@@ -310,6 +310,7 @@ class Dem:
             positive("scene.dem.dt_s", float(self.dt_s), "s")
 
 
+STATES = ("differences", "velocity", "full")  # what a state may hold, smallest first
 PARAMETERS = ("density_kg_m3", "young_modulus_pa", "poisson_ratio", "friction_angle_rad", "damping")
 
 
@@ -360,6 +361,7 @@ class Scene:
             part.check(f"scene.boundary.{name}", (frame * self.frame_dt_s for frame in range(self.n_frames)))
         if self.angle_of_repose is not None:
             self.angle_of_repose.check("scene.angle_of_repose")
+        require(self.state in STATES, "scene.state", self.state, " or ".join(STATES), "see docs/state.md")
         if self.inlet is not None:
             if self.outlet is not None:
                 arm = [a - b for a, b in zip(self.inlet.center_m, self.outlet.point_m, strict=True)]

@@ -20,6 +20,7 @@ OPERATORS: dict[type, Any] = {
     ast.USub: operator.neg,
     ast.UAdd: operator.pos,
 }
+MOST_POWER = 32  # whole exponents up to this one are multiplied out
 LONGEST = 200  # characters of a function
 
 
@@ -41,6 +42,14 @@ def travel(motion: Any, t: Any, library: Any) -> Any:
     return (motion.rate_rad_s if motion.kind == "rotation" else motion.speed_m_s) * t
 
 
+def _power(base: Any, exponent: int) -> Any:
+    """By multiplication: a complex logarithm would spoil the speed of a negative base (see `scene.motion`)."""
+    result = 1.0
+    for _ in range(abs(exponent)):
+        result = result * base
+    return result if exponent >= 0 else 1 / result
+
+
 def _evaluate(text: str, t: Any, library: Any) -> Any:
     if len(text) > LONGEST:
         raise ValueError(f"{len(text)} characters, at most {LONGEST}")
@@ -60,6 +69,13 @@ def _value(node: ast.AST, names: dict[str, Any], library: Any) -> Any:
         return OPERATORS[type(node.op)](_value(node.operand, names, library))
     if isinstance(node, ast.BinOp) and type(node.op) in OPERATORS:
         left, right = (_value(side, names, library) for side in (node.left, node.right))
+        if (
+            isinstance(node.op, ast.Pow)
+            and isinstance(right, float)
+            and right.is_integer()
+            and abs(right) <= MOST_POWER
+        ):
+            return _power(left, int(right))
         return OPERATORS[type(node.op)](left, right)
     called = node.func.id if isinstance(node, ast.Call) and isinstance(node.func, ast.Name) else ""
     if isinstance(node, ast.Call) and called in FUNCTIONS and len(node.args) == 1 and not node.keywords:

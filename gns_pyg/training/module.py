@@ -77,8 +77,8 @@ class TrainingModule(pl.LightningModule):
                 state, frame = self.simulator(state), frame + 1
         following = self.simulator.integrator.read(window, frame + 1)
         error = self.simulator.correction(state) - self.simulator.target(state, following)
-        if state.active is not None and following.active is not None:
-            error = error[state.active & following.active]
+        if window.active is not None and state.active is not None:  # a grain that just entered has no difference yet
+            error = error[state.active & window.active[frame - 1 : frame + 2].all(dim=0)]
         loss = error.square().sum() / max(error.numel(), 1)  # 0 where nobody is there
         if not torch.isfinite(loss):
             raise NumericalError(

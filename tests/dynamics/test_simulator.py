@@ -142,7 +142,7 @@ def test_turning_walls_are_searched_where_they_are():
     )
     expected = {tuple(pair) for pair in near.nonzero().tolist()}
     assert {tuple(pair) for pair in edges.T.tolist()} == expected
-    speed = 3.0 * walls.pos[:n_points, 1:].norm(dim=1)
+    speed = 2 * np.sin(3.0 * 0.01 / 2) / 0.01 * walls.pos[:n_points, 1:].norm(dim=1)  # the chord of a frame
     assert torch.allclose(walls.vel[:n_points].norm(dim=1), speed)
 
 

@@ -8,7 +8,7 @@ import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from gns_pyg.scene.motion import rotation, to_body, to_world
+from gns_pyg.scene.motion import rotation, to_body, to_world, way
 from gns_pyg.scene.scene import Motion
 
 numbers = st.floats(-3.0, 3.0)
@@ -85,3 +85,20 @@ def test_a_quarter_turn_an_oscillation_and_a_way_known_by_hand() -> None:
         placed = to_world(motion, point, second)
         assert placed[0][0].tolist() == pytest.approx(pos, abs=1e-12)
         assert placed[1][0].tolist() == pytest.approx(vel, abs=1e-12)
+
+
+@pytest.mark.parametrize(
+    ("function", "speed"),
+    [
+        ("(t - 1)**4 - 1", lambda t: 4 * (t - 1) ** 3),
+        ("(t - 1)**5 + 1", lambda t: 5 * (t - 1) ** 4),
+        ("(t - 2)**(-3) + 0.125", lambda t: -3 * (t - 2) ** -4),
+        ("0.1 * cos(6 * t)**6 - 0.1", lambda t: -3.6 * torch.cos(6 * t) ** 5 * torch.sin(6 * t)),
+        ("(1 + t)**0.5 - 1", lambda t: 0.5 * (1 + t) ** -0.5),
+    ],
+)
+def test_the_speed_of_powers_is_exact(function, speed):
+    """Of a negative base too, where a complex logarithm would leave 1e-16 over the tiny step."""
+    time_s = torch.linspace(0.0, 1.5, 16, dtype=torch.float64)
+    found = way(Motion(kind="translation", axis=[1.0, 0.0, 0.0], function=function), time_s)[1]
+    assert torch.allclose(found, speed(time_s), rtol=1e-12, atol=1e-12)
