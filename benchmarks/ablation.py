@@ -40,13 +40,23 @@ VARIANTS: dict[str, dict[str, list[str]]] = {
     "drum_bidisperse": {**DEFAULT, "no radius features": ["requires.radius_features=false"]},
     "hopper_friction": {**DEFAULT, "no friction feature": ["requires.material_features=false"]},
 }
-FIGURES = {  # column of the table -> key of metrics.json, factor, form
-    "one step, mm": ("one_step_error_m", 1e3, ".3f"),
-    "end of roll-out, mm": ("rollout_error_final_m", 1e3, ".1f"),
-    "centre of mass, mm": ("center_of_mass_error_max_m", 1e3, ".1f"),
-    "angle of repose, degrees": ("angle_of_repose_error_deg", 1, ".1f"),
-    "overlap, %": ("mean_overlap_ratio", 100, ".2f"),
-    "escaped": ("escaped_grains", 1, ".0f"),
+FIGURES = {  # column of the table -> key of metrics.json, key of what stands beside it in brackets, factor, form
+    "one step, mm (best trivial)": ("one_step_error_m", "one_step_error_trivial_m", 1e3, ".3f"),
+    "end of roll-out, mm (frozen)": ("rollout_error_final_m", "rollout_error_final_frozen_m", 1e3, ".1f"),
+    "centre of mass, mm (climatology)": (
+        "center_of_mass_error_max_m",
+        "center_of_mass_error_climatology_max_m",
+        1e3,
+        ".1f",
+    ),
+    "angle of repose, degrees (climatology)": (
+        "angle_of_repose_error_deg",
+        "angle_of_repose_error_climatology_deg",
+        1,
+        ".1f",
+    ),
+    "overlap, % (DEM)": ("mean_overlap_ratio", "mean_overlap_ratio_dem", 100, ".2f"),
+    "escaped": ("escaped_grains", None, 1, ".0f"),
 }
 
 
@@ -88,12 +98,19 @@ def table(rows: list[dict[str, Any]]) -> str:
     """The results as Markdown."""
     lines = [f"| {' | '.join(['scene', 'variant', 'updates', *FIGURES])} |", "|---" * (3 + len(FIGURES)) + "|"]
     for row in rows:
-        cells = [row["scene"], row["variant"], str(row["updates"])]
-        for key, factor, form in FIGURES.values():
-            value = row["metrics"].get(f"test/{key}")
-            cells.append("diverged" if value is None else f"{factor * value:{form}}")
+        cells = [row["scene"], row["variant"], str(row["updates"]), *figures(row["metrics"])]
         lines.append(f"| {' | '.join(cells)} |")
     return "\n".join(lines)
+
+
+def figures(metrics: dict[str, Any]) -> list[str]:
+    """The cells of `FIGURES`."""
+    cells = []
+    for key, beside, factor, form in FIGURES.values():
+        value, other = (metrics.get(f"test/{name}") for name in (key, beside))
+        cells.append("diverged" if value is None else f"{factor * value:{form}}")
+        cells[-1] += "" if other is None else f" ({factor * other:{form}})"
+    return cells
 
 
 def train(scene: str, *overrides: str) -> dict[str, Any]:

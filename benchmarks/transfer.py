@@ -14,7 +14,7 @@ from typing import Any
 import torch
 from hydra import compose, initialize_config_dir
 
-from benchmarks.ablation import FIGURES
+from benchmarks.ablation import FIGURES, figures
 from gns_pyg import run
 from gns_pyg.config import CONF
 
@@ -58,20 +58,10 @@ def config(name: str, *overrides: str) -> Any:
 
 
 def table(rows: list[dict[str, Any]]) -> str:
-    """The results as Markdown; in brackets what climatology (or, for one step, the best trivial predictor) gives."""
-    beside = {
-        "one_step_error_m": "one_step_error_trivial_m",
-        "center_of_mass_error_max_m": "center_of_mass_error_climatology_max_m",
-        "rollout_error_final_m": "rollout_error_final_frozen_m",
-        "angle_of_repose_error_deg": "angle_of_repose_error_climatology_deg",
-    }
+    """The results as Markdown."""
     lines = [f"| {' | '.join(['scene', 'change', *FIGURES])} |", "|---" * (2 + len(FIGURES)) + "|"]
     for row in rows:
-        cells = [row["scene"], row["change"]]
-        for key, factor, form in FIGURES.values():
-            value, other = (row["metrics"].get(f"test/{k}") for k in (key, beside.get(key)))
-            cells.append(f"{factor * value:{form}}" + ("" if other is None else f" ({factor * other:{form}})"))
-        lines.append(f"| {' | '.join(cells)} |")
+        lines.append(f"| {' | '.join([row['scene'], row['change'], *figures(row['metrics'])])} |")
     return "\n".join(lines)
 
 

@@ -122,7 +122,8 @@ def terms() -> st.SearchStrategy[str]:
 
     def larger(inner: st.SearchStrategy[str]) -> st.SearchStrategy[str]:
         call = st.builds("{}({})".format, st.sampled_from(["sin", "cos", "tanh"]), inner)
-        return st.one_of(call, st.builds("({} {} {})".format, inner, st.sampled_from("+-*"), inner))
+        power = st.builds("{}**{}".format, call, st.integers(0, 4))
+        return st.one_of(call, power, st.builds("({} {} {})".format, inner, st.sampled_from("+-*"), inner))
 
     return st.recursive(leaf, larger, max_leaves=8)
 
