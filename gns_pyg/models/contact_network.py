@@ -1,11 +1,11 @@
 """Encode, process, decode over one kind of contact: the paper's equations (5) to (9)."""
 
 import torch
-from jaxtyping import Float, Int
+from jaxtyping import Bool, Float, Int
 from torch import Tensor, nn
 
 from gns_pyg.models.interaction import Interaction
-from gns_pyg.models.mlp import in_blocks, mlp
+from gns_pyg.models.mlp import blocks, mlp
 
 
 class ContactNetwork(nn.Module):
@@ -58,21 +58,36 @@ class ContactNetwork(nn.Module):
         Where senders are the receivers, `sender_features` is None and every sender must also receive
         (edges come in both directions), so that grains without an edge can be left out of the computation.
         """
-        reached = edge_index[1].unique()
-        grains = reached if self.sparse else torch.arange(len(receiver_features), device=edge_index.device)
-        receivers, receiver = self.encode_receiver(receiver_features[grains]), torch.searchsorted(grains, edge_index[1])
-        senders = None
+        n_receivers, sparse = len(receiver_features), self.sparse and edge_index.device.type == "cpu"
+        reached = torch.zeros(n_receivers, dtype=torch.bool, device=edge_index.device).index_fill(
+            0, edge_index[1], True
+        )
+        sender, receiver = edge_index
+        if sparse:
+            grains, receiver = _compact(reached, receiver)
+            receiver_features = receiver_features[grains]
+        receivers = self.encode_receiver(receiver_features)
         if self.encode_sender is None or sender_features is None:
-            sender = torch.searchsorted(grains, edge_index[0])
-        elif self.sparse:
-            reaching, sender = edge_index[0].unique(return_inverse=True)
-            senders = self.encode_sender(sender_features[reaching])
+            senders = None
+            sender = _compact(reached, sender)[1] if sparse else sender
         else:
-            senders, sender = self.encode_sender(sender_features), edge_index[0]
-        edges, compact = in_blocks(self.encode_edge, edge_features), torch.stack([sender, receiver])
+            if sparse:
+                sending = torch.zeros(len(sender_features), dtype=torch.bool).index_fill(0, sender, True)
+                points, sender = _compact(sending, sender)
+                sender_features = sender_features[points]
+            senders = self.encode_sender(sender_features)
+        edges, ends = (
+            [self.encode_edge(block) for block in blocks(edge_features)],
+            blocks(torch.stack([sender, receiver]), 1),
+        )
         for interaction in self.interactions:
-            receivers, edges = interaction(receivers if senders is None else senders, receivers, edges, compact)
+            receivers, edges = interaction(receivers if senders is None else senders, receivers, edges, ends)
         effect = self.decode(receivers)
-        if not self.sparse:
-            effect = effect[reached]
-        return receiver_features.new_zeros(len(receiver_features), self.n_out).index_copy(0, reached, effect)
+        if sparse:
+            return effect.new_zeros(n_receivers, self.n_out).index_copy(0, grains, effect)
+        return torch.where(reached[:, None], effect, 0.0)
+
+
+def _compact(chosen: Bool[Tensor, " n"], index: Int[Tensor, " e"]) -> tuple[Int[Tensor, " m"], Int[Tensor, " e"]]:
+    """Rows that are chosen, and `index`, which names only those, counted among them."""
+    return chosen.nonzero().flatten(), (chosen.cumsum(0) - 1)[index]

@@ -1,11 +1,13 @@
 """One round of message passing: the paper's equations (7) and (8)."""
 
+from collections.abc import Sequence
+
 import torch
 from jaxtyping import Float, Int
 from torch import Tensor, nn
 from torch_geometric.nn import MessagePassing
 
-from gns_pyg.models.mlp import BLOCK, blocks_pay, mlp
+from gns_pyg.models.mlp import mlp
 
 
 class Interaction(MessagePassing):
@@ -19,9 +21,12 @@ class Interaction(MessagePassing):
         mlp_layers: linear layers of each MLP.
         skip: adds each MLP's input latent to its output and normalises its layers (not in the paper).
 
+    Edges come in blocks (see `mlp.blocks`). One block takes PyG's own way; several go one after the other through all
+    layers while they are in the processor's cache, with the same result.
+
     Shapes:
-        senders (n_senders, hidden), receivers (n_receivers, hidden), edges (n_edges, hidden) ->
-        receivers (n_receivers, hidden), edges (n_edges, hidden)
+        senders (n_senders, hidden), receivers (n_receivers, hidden), edges n_blocks x (n, hidden) ->
+        receivers (n_receivers, hidden), edges n_blocks x (n, hidden)
     """
 
     def __init__(self, hidden: int, mlp_layers: int, *, skip: bool) -> None:
@@ -39,33 +44,27 @@ class Interaction(MessagePassing):
         self,
         senders: Float[Tensor, "n_senders hidden"],
         receivers: Float[Tensor, "n_receivers hidden"],
-        edges: Float[Tensor, "n_edges hidden"],
-        edge_index: Int[Tensor, "2 n_edges"],
-    ) -> tuple[Float[Tensor, "n_receivers hidden"], Float[Tensor, "n_edges hidden"]]:
+        edges: Sequence[Float[Tensor, "_ hidden"]],
+        edge_index: Sequence[Int[Tensor, "2 _"]],
+    ) -> tuple[Float[Tensor, "n_receivers hidden"], list[Float[Tensor, "_ hidden"]]]:
         size = (senders.shape[0], receivers.shape[0])
         nodes = (self.from_sender(senders), self.from_receiver(receivers))
-        if blocks_pay(edges):
-            received, edges = self._in_blocks(nodes, edges, edge_index)
+        if len(edges) == 1:
+            messages = [self.edge_updater(edge_index[0], x=nodes, edge=self.from_edge(edges[0]), size=size)]
+            received = self.propagate(edge_index[0], messages=messages[0], size=size)
         else:
-            messages = self.edge_updater(edge_index, x=nodes, edge=self.from_edge(edges), size=size)
-            received = self.propagate(edge_index, messages=messages, size=size)
-            edges = edges + messages if self.skip else messages
+            messages, received = [], torch.zeros_like(nodes[1])
+            for block, (sender, receiver) in zip(edges, edge_index, strict=True):
+                ends = nodes[0].index_select(0, sender), nodes[1].index_select(0, receiver)
+                messages.append(self.edge_update(*ends, self.from_edge(block)))
+                received.index_add_(0, receiver, messages[-1])
         updated = self.update_mlp(torch.cat([receivers, received], dim=1))
-        return receivers + updated if self.skip else updated, edges
-
-    def _in_blocks(self, nodes: tuple[Tensor, Tensor], edges: Tensor, edge_index: Tensor) -> tuple[Tensor, Tensor]:
-        """What receivers are sent and the new edges; a block of edges goes through all layers while it is in cache."""
-        received, after = torch.zeros_like(nodes[1]), torch.empty_like(edges)
-        for start in range(0, len(edges), BLOCK):
-            block = slice(start, start + BLOCK)
-            sender, receiver = edge_index[:, block]
-            messages = self.edge_update(nodes[0][sender], nodes[1][receiver], self.from_edge(edges[block]))
-            received.index_add_(0, receiver, messages)
-            after[block] = edges[block] + messages if self.skip else messages
-        return received, after
+        if not self.skip:
+            return updated, messages
+        return receivers + updated, [edge + message for edge, message in zip(edges, messages, strict=True)]
 
     def edge_update(self, x_j: Tensor, x_i: Tensor, edge: Tensor) -> Tensor:
-        return self.message_mlp(torch.relu(x_i + x_j + edge))
+        return self.message_mlp((x_i + x_j).add_(edge).relu_())
 
     def message(self, messages: Tensor) -> Tensor:
         return messages

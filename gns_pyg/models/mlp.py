@@ -2,10 +2,9 @@
 
 import itertools
 
-import torch
 from torch import Tensor, nn
 
-BLOCK = 1024  # rows handled at once where no gradient is asked for: small enough to stay in the processor's cache
+BLOCK = 1024  # rows that a CPU handles at once: few enough to stay in its cache through all layers
 
 
 def mlp(n_in: int, hidden: int, n_out: int, layers: int, *, layer_norm: bool = False) -> nn.Sequential:
@@ -16,16 +15,11 @@ def mlp(n_in: int, hidden: int, n_out: int, layers: int, *, layer_norm: bool = F
     widths = [n_in, *[hidden] * (layers - 1), n_out]
     modules: list[nn.Module] = []
     for wide, narrow in itertools.pairwise(widths):
-        modules += [nn.Linear(wide, narrow), nn.ReLU()]
+        modules += [nn.Linear(wide, narrow), nn.ReLU(inplace=True)]
     modules.pop()
     return nn.Sequential(*modules, *([nn.LayerNorm(n_out)] if layer_norm else []))
 
 
-def blocks_pay(rows: Tensor) -> bool:
-    """Whether rows are better handled block after block: on a CPU, without gradients, if there are many."""
-    return rows.device.type == "cpu" and not torch.is_grad_enabled() and len(rows) > BLOCK
-
-
-def in_blocks(network: nn.Module, rows: Tensor) -> Tensor:
-    """`network(rows)`, block after block where that pays."""
-    return torch.cat([network(block) for block in rows.split(BLOCK)]) if blocks_pay(rows) else network(rows)
+def blocks(rows: Tensor, dim: int = 0) -> tuple[Tensor, ...]:
+    """`rows` in pieces that are best handled one after the other; a GPU takes all at once."""
+    return rows.split(BLOCK, dim) if rows.device.type == "cpu" else (rows,)

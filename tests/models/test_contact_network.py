@@ -21,9 +21,9 @@ def test_split_first_layer_is_the_layer_on_the_concatenation():
     messages = block.message_mlp(torch.relu(joined @ weight.T + block.from_receiver.bias))
     received = torch.stack([messages[edge_index[1] == i].sum(0) for i in range(5)])
     expected = block.update_mlp(torch.cat([receivers, received], dim=1))
-    updated, kept = block(senders, receivers, edges, edge_index)
+    updated, kept = block(senders, receivers, [edges], [edge_index])
     assert torch.allclose(updated, expected)
-    assert torch.allclose(kept, messages)
+    assert torch.allclose(kept[0], messages)
 
 
 def network(**changes):
@@ -68,17 +68,32 @@ def test_edges_carry_from_sender_to_receiver():
 
 @pytest.mark.parametrize("skip", [True, False])
 @pytest.mark.parametrize("n_sender", [None, 4])
-def test_blocks_without_gradients_are_the_plain_network(skip, n_sender, monkeypatch):
-    monkeypatch.setattr("gns_pyg.models.mlp.BLOCK", 16)
-    monkeypatch.setattr("gns_pyg.models.interaction.BLOCK", 16)
+def test_edges_in_blocks_are_the_plain_network_with_the_same_gradients(skip, n_sender, monkeypatch):
     random = torch.Generator().manual_seed(1)
     model = network(skip=skip, n_sender=n_sender)
     grains, edges = torch.randn(12, 3, generator=random), torch.randn(90, 2, generator=random)
     pairs = torch.randint(0, 11, (2, 45), generator=random)
     edge_index = torch.cat([pairs, pairs.flip(0)], dim=1)
     senders = None if n_sender is None else torch.randn(12, 4, generator=random)
-    plain = model(senders, grains, edges, edge_index)
-    with torch.inference_mode():
-        blocked = model(senders, grains, edges, edge_index)
-    assert plain.requires_grad
-    assert torch.allclose(plain, blocked, rtol=1e-5, atol=1e-6)
+
+    def results() -> list[torch.Tensor]:
+        inputs = [grains.clone().requires_grad_(), edges.clone().requires_grad_()]
+        effect = model(senders, *inputs, edge_index)
+        used = [*inputs, *model.parameters()]
+        return [effect.detach(), *torch.autograd.grad(effect.square().sum(), used)]
+
+    plain = results()
+    monkeypatch.setattr("gns_pyg.models.mlp.BLOCK", 16)
+    for expected, found in zip(plain, results(), strict=True):
+        assert torch.allclose(found, expected, rtol=1e-5, atol=1e-5 * float(expected.abs().max()))
+
+
+@pytest.mark.parametrize("n_sender", [None, 4])
+def test_computing_all_grains_gives_what_computing_the_reached_ones_gives(n_sender):
+    points, grains, edges = torch.randn(5, 4), torch.randn(9, 3), torch.randn(4, 2)
+    edge_index = torch.tensor([[0, 2, 4, 2], [2, 0, 2, 4]])
+    few, everyone = (network(n_sender=n_sender, sparse=sparse) for sparse in (True, False))
+    senders = None if n_sender is None else points
+    out = everyone(senders, grains, edges, edge_index)
+    assert torch.allclose(out, few(senders, grains, edges, edge_index), rtol=1e-5, atol=1e-7)
+    assert torch.equal(out[[1, 3, 5, 6, 7, 8]], torch.zeros(6, 3))
