@@ -42,6 +42,7 @@ ROWS = {  # row -> whether leaving it out changes nothing at all
     "material_features": False,
     "active_mask": True,
 }
+OF_WALLS = ("wall_velocity", "wall_friction", "static_walls", "reachable_points")
 COLUMNS = {"parameters": ",", "edges": ",.0f", "ms": ".1f"}
 FRAMES, ROUNDS, EARLY_S = 12, 15, 0.2
 OUT = Path(__file__).parent / "results" / "requirements.json"
@@ -49,10 +50,10 @@ OUT = Path(__file__).parent / "results" / "requirements.json"
 
 def main() -> None:
     torch.set_num_threads(1)
-    results = [row for name in sys.argv[1:] or SCENES for row in of_scene(name)]
-    if sys.argv[1:] and OUT.exists():
-        results = [row for row in json.loads(OUT.read_text()) if row["scene"] not in sys.argv[1:]] + results
-    OUT.write_text(json.dumps(results, indent=1) + "\n")
+    for name in sys.argv[1:] or SCENES:
+        others = [row for row in json.loads(OUT.read_text()) if row["scene"] != name] if OUT.exists() else []
+        results = sorted([*others, *of_scene(name)], key=lambda row: SCENES.index(row["scene"]))
+        OUT.write_text(json.dumps(results, indent=1) + "\n")
     print(table(results))
 
 
@@ -74,9 +75,7 @@ def of_scene(name: str) -> list[dict[str, Any]]:
     for row, exact in ROWS.items():
         row, _, when = row.partition(" ")
         prunes = row in ("static_walls", "reachable_points", "free_grains")
-        if prunes != bool(getattr(own.requires, row)) or (
-            row in ("static_walls", "reachable_points") and own.boundary is None
-        ):
+        if prunes != bool(getattr(own.requires, row)) or (row in OF_WALLS and own.boundary is None):
             continue
         starts = torch.linspace(0, early if when else last, FRAMES).long().tolist()
         states = other_states = [own.integrator.read(read_window(case, start, 3), 1) for start in starts]
