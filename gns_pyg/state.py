@@ -4,6 +4,7 @@ Conventions: SI units. Edges: `edges[0]` sends, `edges[1]` receives; `rel_pos = 
 Several graphs are batched by concatenating their grains; `batch` says which graph a grain belongs to.
 """
 
+from collections.abc import Sequence
 from dataclasses import dataclass, fields, replace
 from typing import TypeVar
 
@@ -12,6 +13,12 @@ from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
 AnyRecord = TypeVar("AnyRecord", bound="Record")
+
+
+def constant(values: Sequence[float], like: Tensor) -> Tensor:
+    """`values` with the dtype and on the device of `like`, (len(values),); nothing is copied from the host, so a CUDA
+    graph can hold it."""
+    return torch.stack([like.new_full((), value) for value in values])
 
 
 class Record:

@@ -4,12 +4,13 @@ from collections.abc import Callable, Iterable, Iterator, Mapping
 from typing import cast
 
 import torch
-from jaxtyping import Float, Int
+from jaxtyping import Bool, Float, Int
 from torch import Tensor, nn
 
+from gns_pyg.dynamics.model_config import ModelConfig
 from gns_pyg.graph.neighbors import Index, backend
 from gns_pyg.scene.boundary_points import BoundaryPoints
-from gns_pyg.scene.motion import rotation, to_body, to_world
+from gns_pyg.scene.motion import to_body, to_world, turn
 from gns_pyg.scene.scene import Part, Scene
 from gns_pyg.state import State, Walls
 
@@ -21,19 +22,19 @@ class BoundaryPart(nn.Module):
     Args:
         points: boundary points at t = 0.
         part: gives the rigid motion and the friction angle.
-        dt_s: frame, s.
-        neighbors: search backend (see `graph.neighbors`).
+        scene: gives the frame and the radii.
+        config: gives the search backend (see `graph.neighbors`) and how many radii a grain reaches.
         static: build the search structure once; else at every search (only to measure what that costs).
     """
 
     pos: Tensor
     normal: Tensor
 
-    def __init__(self, points: BoundaryPoints, part: Part, dt_s: float, neighbors: str, *, static: bool) -> None:
+    def __init__(self, points: BoundaryPoints, part: Part, scene: Scene, config: ModelConfig, *, static: bool) -> None:
         super().__init__()
-        self.dt_s = dt_s
+        self.dt_s, self.radii_m = scene.frame_dt_s, scene.grains.radii_m
         self.motion, self.friction_angle_rad = part.motion, part.friction_angle_rad
-        self.neighbors, self.static = neighbors, static
+        self.config, self.static = config, static
         self.register_buffer("pos", torch.as_tensor(points.pos, dtype=torch.float64))
         self.register_buffer("normal", torch.as_tensor(points.normal, dtype=torch.float64))
         self._index: Index | None = None
@@ -51,21 +52,34 @@ class BoundaryPart(nn.Module):
         normal = self.normal[rows]
         if self.motion.moves:
             vel = (to_world(self.motion, self.pos[rows], time_s + self.dt_s)[0] - pos) / self.dt_s
-            normal = torch.einsum("nij,nj->ni", rotation(self.motion, time_s), normal)
+            normal = turn(self.motion, normal, time_s)
         return Walls(pos, normal, vel, torch.full_like(time_s, self.friction_angle_rad))
 
-    def within(self, state: State, reach_m: Float[Tensor, " n_grains"]) -> tuple[Int[Tensor, " e"], Int[Tensor, " e"]]:
-        """Every (point, grain) at most the grain's reach apart."""
+    @property
+    def cutoff_m(self) -> float:
+        """Reach of the largest grain."""
+        return self.config.cutoff_wall_radii * max(self.radii_m)
+
+    def body_pos(self, state: State) -> Float[Tensor, "n_grains 3"]:
+        """Grains in the part's body frame, m."""
+        return to_body(self.motion, state.pos.detach(), state.time_s[state.batch])
+
+    def in_reach(
+        self, body_pos: Float[Tensor, "n 3"], radius: Float[Tensor, " n"], edges: Int[Tensor, "2 e"]
+    ) -> Bool[Tensor, " e"]:
+        """Which [point, grain] are within the grain's own reach."""
+        point, grain = edges
+        reach = self.config.cutoff_wall_radii * radius[grain]
+        return (self.pos[point] - body_pos[grain]).square().sum(1) <= reach.square()
+
+    def within(self, state: State) -> Int[Tensor, "2 e"]:
+        """Every [point, grain] at most the grain's reach apart."""
         if self._index is None or not self.static:
-            build = backend(self.neighbors, self.pos.device).build
+            build = backend(self.config.neighbors, self.pos.device).build
             self._index = build(self.pos, torch.zeros(len(self.pos), dtype=torch.long, device=self.pos.device))
-        body_pos = to_body(self.motion, state.pos.detach(), state.time_s[state.batch])
-        farthest = float(reach_m.max()) if len(reach_m) else 0.0
-        point, grain = self._index(body_pos, torch.zeros_like(state.batch), farthest)
-        if (reach_m == farthest).all():
-            return point, grain
-        near = (self.pos[point] - body_pos[grain]).square().sum(1) <= reach_m[grain].square()
-        return point[near], grain[near]
+        body_pos = self.body_pos(state)
+        edges = self._index(body_pos, torch.zeros_like(state.batch), self.cutoff_m)
+        return edges if len(self.radii_m) == 1 else edges[:, self.in_reach(body_pos, state.radius, edges)]
 
 
 class Boundary(nn.Module):
@@ -74,29 +88,28 @@ class Boundary(nn.Module):
     Args:
         scene: gives the parts.
         points: their points.
-        neighbors: search backend.
+        config: see `BoundaryPart`.
         static: see `BoundaryPart`.
         reachable: only points that a grain reaches are placed in the world; else all of them.
     """
 
     def __init__(
-        self, scene: Scene, points: Mapping[str, BoundaryPoints], neighbors: str, *, static: bool, reachable: bool
+        self, scene: Scene, points: Mapping[str, BoundaryPoints], config: ModelConfig, *, static: bool, reachable: bool
     ) -> None:
         super().__init__()
         self.parts = nn.ModuleList(
-            BoundaryPart(points[name], part, scene.frame_dt_s, neighbors, static=static)
-            for name, part in scene.boundary.items()
+            BoundaryPart(points[name], part, scene, config, static=static) for name, part in scene.boundary.items()
         )
         self.reachable = reachable
 
     def __iter__(self) -> Iterator[BoundaryPart]:
         return iter(cast(Iterable[BoundaryPart], self.parts))
 
-    def contacts(self, state: State, reach_m: Float[Tensor, " n_grains"]) -> tuple[Walls, Int[Tensor, "2 e"]]:
+    def contacts(self, state: State) -> tuple[Walls, Int[Tensor, "2 e"]]:
         """Boundary points in the world and [point, grain] for every pair within the grain's reach."""
         found, walls, n_rows = [state.batch.new_empty(2, 0)], [], 0
         for part in self:
-            point, grain = part.within(state, reach_m)
+            point, grain = part.within(state)
             row = state.batch[grain] * len(part.pos) + point  # graph after graph
             if self.reachable:
                 rows, sender = row.unique(return_inverse=True)

@@ -22,22 +22,22 @@ def can_touch(state: State, free_pos: Float[Tensor, "n_grains 3"], graph: Graph,
         graph: neighbours and boundary points within the cutoffs.
         dt_s: frame, s.
     """
-    touches = torch.zeros(len(state.pos), dtype=torch.bool, device=state.pos.device)
-    way = free_pos - state.pos
-    sender, receiver = pairs = graph.grain_edges[:, graph.grain_edges[0] < graph.grain_edges[1]]  # once is enough
-    where = torch.cat([state.pos, way], dim=1)
-    rel_pos, rel_way = (where[sender] - where[receiver]).split(3, dim=1)
+    n, way = len(state.pos), free_pos - state.pos
+    sender, receiver = graph.grain_edges
+    rel_pos, rel_way = state.pos[sender] - state.pos[receiver], way[sender] - way[receiver]
     distance = torch.linalg.vector_norm(rel_pos, dim=1)
     reach = state.radius[sender] + state.radius[receiver]
     closing = -(rel_way * rel_pos).sum(1) / distance.clamp(min=1e-9)
-    touches[pairs[:, distance - reach <= closing.clamp(min=0) + MARGIN_RADII * reach / 2]] = True
+    near = distance - reach <= closing.clamp(min=0) + MARGIN_RADII * reach / 2
+    touches = torch.zeros(n, device=near.device).index_add(0, receiver, (near & (sender != receiver)).float())
     if graph.walls is not None:
         point, grain = graph.wall_edges
         normal, radius = graph.walls.normal[point], state.radius[grain]
         height = ((state.pos[grain] - graph.walls.pos[point]) * normal).sum(1)
         closing = ((graph.walls.vel[point] * dt_s - way[grain]) * normal).sum(1)
-        touches[grain[height - radius <= closing.clamp(min=0) + MARGIN_RADII * radius]] = True
-    return touches
+        near = height - radius <= closing.clamp(min=0) + MARGIN_RADII * radius
+        touches = touches.index_add(0, grain, near.float())
+    return touches > 0
 
 
 def among(graph: Graph, touches: Bool[Tensor, " n_grains"]) -> Graph:

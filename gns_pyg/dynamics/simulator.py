@@ -5,7 +5,7 @@ from dataclasses import replace
 from typing import Any
 
 import torch
-from jaxtyping import Float
+from jaxtyping import Bool, Float, Int
 from torch import Tensor, nn
 
 from gns_pyg.dynamics.boundary import Boundary
@@ -20,7 +20,7 @@ from gns_pyg.models.statistics import Statistics
 from gns_pyg.scene.boundary_points import BoundaryPoints
 from gns_pyg.scene.requirements import Requirements
 from gns_pyg.scene.scene import PARAMETERS, Scene
-from gns_pyg.state import Graph, State, Walls
+from gns_pyg.state import Graph, State, Walls, constant
 
 
 class Simulator(nn.Module):
@@ -66,7 +66,7 @@ class Simulator(nn.Module):
         self.wall_network: ContactNetwork | None = None
         if requires.wall_network:
             static, reachable = requires.static_walls, requires.reachable_points
-            self.boundary = Boundary(scene, points, config.neighbors, static=static, reachable=reachable)
+            self.boundary = Boundary(scene, points, config, static=static, reachable=reachable)
             n_point = 3 + 3 * requires.wall_velocity + requires.wall_friction + n_position
             n_edge = features.n_wall_edge_features(config.contact_features)
             self.wall_network = ContactNetwork(
@@ -92,7 +92,10 @@ class Simulator(nn.Module):
         return there.new_zeros(len(state.pos), there.shape[1]).masked_scatter(state.active[:, None], there)
 
     def _contacts(self, state: State) -> Float[Tensor, "n_grains d"]:
-        graph = self.graph(state)
+        return self.effects(state, self.graph(state))
+
+    def effects(self, state: State, graph: Graph) -> Float[Tensor, "n_grains d"]:
+        """What the contacts of `graph` add, over `scale`; 0 for a grain without an edge."""
         grains = self._grain_features(state)
         options: dict[str, Any] = dict(
             velocity_m_s=self.statistics.velocity_m_s,
@@ -106,20 +109,28 @@ class Simulator(nn.Module):
             total = total + self.wall_network(self._wall_features(graph.walls), grains, edges, graph.wall_edges)
         return total
 
+    @property
+    def cutoff_m(self) -> float:
+        """Reach of grain-grain edges: of the largest grain."""
+        return self.config.cutoff_grain_radii * max(self.scene.grains.radii_m)
+
+    def in_reach(self, state: State, edges: Int[Tensor, "2 e"]) -> Bool[Tensor, " e"]:
+        """Which pairs are within their own cutoff: that many times the mean of their radii."""
+        sender, receiver = edges
+        reach = self.config.cutoff_grain_radii * (state.radius[sender] + state.radius[receiver]) / 2
+        return (state.pos[sender] - state.pos[receiver]).square().sum(1) <= reach.square()
+
     def graph(self, state: State) -> Graph:
         """Who can touch whom within the cutoffs. Not differentiable."""
         state = replace(state, pos=state.pos.detach(), vel=state.vel.detach())
-        largest = float(state.radius.max()) if len(state.radius) else 0.0
         index = backend(self.config.neighbors, state.pos.device).build(state.pos, state.batch)
         search = index if self.config.self_loops else pairs(index)
-        edges = search(state.pos, state.batch, self.config.cutoff_grain_radii * largest)
-        if len(self.scene.grains.radii_m) > 1:  # the cutoff of a pair is that many times the mean of its radii
-            sender, receiver = edges
-            reach = self.config.cutoff_grain_radii * (state.radius[sender] + state.radius[receiver]) / 2
-            edges = edges[:, (state.pos[sender] - state.pos[receiver]).square().sum(1) <= reach.square()]
+        edges = search(state.pos, state.batch, self.cutoff_m)
+        if len(self.scene.grains.radii_m) > 1:
+            edges = edges[:, self.in_reach(state, edges)]
         graph = Graph(edges, edges.new_empty(2, 0))
         if self.boundary is not None:
-            walls, contacts = self.boundary.contacts(state, self.config.cutoff_wall_radii * state.radius)
+            walls, contacts = self.boundary.contacts(state)
             graph = Graph(edges, contacts, walls)
         if self.requires.free_grains:
             free_pos = self.integrator.without_contact(state).pos
@@ -134,7 +145,7 @@ class Simulator(nn.Module):
             columns.append(state.radius[:, None] / self.statistics.radius_m)
         if self._conditions and state.parameters is not None:
             mean, std = (
-                state.pos.new_tensor(v) for v in (self.statistics.parameters_mean, self.statistics.parameters_std)
+                constant(v, state.pos) for v in (self.statistics.parameters_mean, self.statistics.parameters_std)
             )
             columns.append(((state.parameters - mean) / std)[:, self._conditions][state.batch])
         if self.config.absolute_position:
@@ -152,4 +163,4 @@ class Simulator(nn.Module):
         return torch.cat(columns, dim=1).to(self.scale.dtype)
 
     def _absolute(self, pos: Tensor) -> Tensor:
-        return (pos - pos.new_tensor(self.statistics.position_mean_m)) / self.statistics.position_std_m
+        return (pos - constant(self.statistics.position_mean_m, pos)) / self.statistics.position_std_m

@@ -53,11 +53,11 @@ class Interaction(MessagePassing):
             messages = [self.edge_updater(edge_index[0], x=nodes, edge=self.from_edge(edges[0]), size=size)]
             received = self.propagate(edge_index[0], messages=messages[0], size=size)
         else:
-            messages, received = [], torch.zeros_like(nodes[1])
+            messages, received = [], torch.zeros_like(receivers)
             for block, (sender, receiver) in zip(edges, edge_index, strict=True):
                 ends = nodes[0].index_select(0, sender), nodes[1].index_select(0, receiver)
                 messages.append(self.edge_update(*ends, self.from_edge(block)))
-                received.index_add_(0, receiver, messages[-1])
+                received.index_add_(0, receiver, messages[-1].to(received.dtype))  # sums stay in full precision
         updated = self.update_mlp(torch.cat([receivers, received], dim=1))
         if not self.skip:
             return updated, messages

@@ -5,6 +5,7 @@ from jaxtyping import Float
 from torch import Tensor
 
 from gns_pyg.scene.scene import Scene
+from gns_pyg.state import constant
 
 
 def free_flight(
@@ -30,7 +31,7 @@ def free_flight(
     Returns:
         Position and velocity after `dt_s`.
     """
-    gravity = torch.tensor(scene.gravity_m_s2, dtype=pos.dtype, device=pos.device)
+    gravity = constant(scene.gravity_m_s2, pos)
     felt = torch.full_like(pos[:, :1], scene.damping) if damping is None else damping[:, None].to(pos.dtype)
     felt = felt if scene.damping_on_gravity else torch.zeros_like(felt)
     slowing, speeding = gravity * (1 + felt), gravity * (1 - felt)

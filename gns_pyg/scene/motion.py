@@ -1,24 +1,28 @@
 """Exact rigid kinematics of boundary parts. A part's body frame is its pose at t = 0."""
 
+import math
+
 import torch
 from jaxtyping import Float
 from torch import Tensor
 
 from gns_pyg.scene.scene import Motion
 from gns_pyg.scene.travel import travel
+from gns_pyg.state import constant
 
 STEP_S = 1e-30  # of the complex-step derivative: no difference is taken, so it cannot be too small
 
 
-def rotation(motion: Motion, time_s: Float[Tensor, " b"]) -> Float[Tensor, "b 3 3"]:
-    """Rotation from the body frame to the world frame at each time (Rodrigues' formula)."""
-    eye = torch.eye(3, dtype=time_s.dtype, device=time_s.device).expand(len(time_s), 3, 3)
+def turn(
+    motion: Motion, vectors: Float[Tensor, "n 3"], time_s: Float[Tensor, " n"], *, back: bool = False
+) -> Float[Tensor, "n 3"]:
+    """Turns directions, each at its own time, from the body frame into the world, or `back` (Rodrigues' formula)."""
     if motion.kind != "rotation":
-        return eye
-    x, y, z = _axis(motion, time_s).tolist()
-    cross = torch.tensor([[0, -z, y], [z, 0, -x], [-y, x, 0]], dtype=time_s.dtype, device=time_s.device)
-    angle = way(motion, time_s)[0][:, None, None]
-    return eye + torch.sin(angle) * cross + (1 - torch.cos(angle)) * (cross @ cross)
+        return vectors
+    axis, angle = _axis(motion, vectors), way(motion, time_s)[0][:, None]
+    cos, sin = torch.cos(angle), torch.sin(-angle if back else angle)
+    along = (vectors * axis).sum(1, keepdim=True) * axis
+    return vectors * cos + torch.linalg.cross(axis.expand_as(vectors), vectors) * sin + along * (1 - cos)
 
 
 def way(motion: Motion, time_s: Float[Tensor, " b"]) -> tuple[Float[Tensor, " b"], Float[Tensor, " b"]]:
@@ -40,8 +44,8 @@ def to_world(
     come, speed = (value[:, None] * _axis(motion, points) for value in way(motion, time_s))
     if motion.kind != "rotation":
         return points + come, speed
-    origin = _origin(motion, points)
-    arm = torch.einsum("nij,nj->ni", rotation(motion, time_s), points - origin)
+    origin = constant(motion.origin_m, points)
+    arm = turn(motion, points - origin, time_s)
     return arm + origin, torch.linalg.cross(speed, arm)
 
 
@@ -51,14 +55,10 @@ def to_body(motion: Motion, pos: Float[Tensor, "n 3"], time_s: Float[Tensor, " n
         return pos
     if motion.kind != "rotation":
         return pos - way(motion, time_s)[0][:, None] * _axis(motion, pos)
-    origin = _origin(motion, pos)
-    return torch.einsum("nji,nj->ni", rotation(motion, time_s), pos - origin) + origin
+    origin = constant(motion.origin_m, pos)
+    return turn(motion, pos - origin, time_s, back=True) + origin
 
 
 def _axis(motion: Motion, like: Tensor) -> Tensor:
-    axis = torch.tensor(motion.axis, dtype=like.dtype, device=like.device)
-    return axis / axis.norm()
-
-
-def _origin(motion: Motion, like: Tensor) -> Tensor:
-    return torch.tensor(motion.origin_m, dtype=like.dtype, device=like.device)
+    length = math.hypot(*motion.axis)
+    return constant([value / length for value in motion.axis], like)

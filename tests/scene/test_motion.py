@@ -8,7 +8,7 @@ import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from gns_pyg.scene.motion import rotation, to_body, to_world, way
+from gns_pyg.scene.motion import to_body, to_world, turn, way
 from gns_pyg.scene.scene import Motion
 
 numbers = st.floats(-3.0, 3.0)
@@ -68,17 +68,18 @@ def test_a_part_stays_rigid_and_starts_in_its_body_frame(values, seed, t) -> Non
     torch.testing.assert_close(torch.cdist(placed, placed), torch.cdist(pos, pos), rtol=0, atol=1e-6)
     at_start = to_world(motion, pos, torch.zeros(len(pos), dtype=torch.float64))[0]
     torch.testing.assert_close(at_start, pos, rtol=0, atol=1e-12)
-    turn = rotation(motion, torch.tensor([t], dtype=torch.float64))[0]
-    torch.testing.assert_close(turn @ turn.T, torch.eye(3, dtype=torch.float64), rtol=0, atol=1e-12)
+    axes = turn(motion, torch.eye(3, dtype=torch.float64), torch.full((3,), t, dtype=torch.float64))
+    torch.testing.assert_close(axes @ axes.T, torch.eye(3, dtype=torch.float64), rtol=0, atol=1e-12)
+    assert torch.linalg.det(axes) > 0
 
 
 def test_a_quarter_turn_an_oscillation_and_a_way_known_by_hand() -> None:
     point, second = torch.tensor([[2.0, 0.0, 0.0]], dtype=torch.float64), torch.ones(1, dtype=torch.float64)
-    turn = Motion("rotation", [0.0, 0.0, 5.0], [1.0, 0.0, 0.0], rate_rad_s=math.pi / 2)
+    spin = Motion("rotation", [0.0, 0.0, 5.0], [1.0, 0.0, 0.0], rate_rad_s=math.pi / 2)
     shake = Motion("oscillation", [0.0, 2.0, 0.0], amplitude_m=0.1, frequency_hz=0.25)
     slide = Motion("translation", [3.0, 4.0, 0.0], function="5 * t**2")
     for motion, pos, vel in (
-        (turn, [1.0, 1.0, 0.0], [-math.pi / 2, 0.0, 0.0]),
+        (spin, [1.0, 1.0, 0.0], [-math.pi / 2, 0.0, 0.0]),
         (shake, [2.0, 0.1, 0.0], [0.0, 0.0, 0.0]),
         (slide, [5.0, 4.0, 0.0], [6.0, 8.0, 0.0]),
     ):
