@@ -63,8 +63,8 @@ class State(Record):
     def n_graphs(self) -> int:
         return self.time_s.shape[0]
 
-    def pick(self, grains: Bool[Tensor, " n_grains"]) -> "State":
-        """The state of some of the grains, all of them active; graphs stay."""
+    def pick(self, grains: Bool[Tensor, " n_grains"] | Int[Tensor, " n_picked"]) -> "State":
+        """The state of some of the grains, by mask or by ascending number; graphs stay."""
         return replace(
             self,
             pos=self.pos[grains],
@@ -72,7 +72,7 @@ class State(Record):
             ang_vel=None if self.ang_vel is None else self.ang_vel[grains],
             radius=self.radius[grains],
             batch=self.batch[grains],
-            active=None,
+            active=None if self.active is None else self.active[grains],
         )
 
 

@@ -13,6 +13,7 @@ from gns_pyg.dynamics.free_grains import among, can_touch
 from gns_pyg.dynamics.integrator import Integrator
 from gns_pyg.dynamics.model_config import ModelConfig
 from gns_pyg.dynamics.passage import Passage
+from gns_pyg.dynamics.tiles import tiles
 from gns_pyg.graph import features
 from gns_pyg.graph.neighbors import backend, pairs
 from gns_pyg.models.contact_network import ContactNetwork
@@ -49,6 +50,7 @@ class Simulator(nn.Module):
         self.integrator = Integrator(scene, requires.state, free_flight=requires.free_flight)
         scale = torch.tensor(statistics.correction).repeat_interleave(3)
         self.register_buffer("scale", scale, persistent=False)
+        self.tile_grains: int | None = None  # more grains than this are computed tile by tile, with the same result
         self._conditions = [PARAMETERS.index(name) for name in requires.material_features]
 
         width: dict[str, Any] = dict(
@@ -88,11 +90,17 @@ class Simulator(nn.Module):
         is not active."""
         if state.active is None:
             return self._contacts(state)
-        there = self._contacts(state.pick(state.active))
+        there = self._contacts(replace(state.pick(state.active), active=None))
         return there.new_zeros(len(state.pos), there.shape[1]).masked_scatter(state.active[:, None], there)
 
     def _contacts(self, state: State) -> Float[Tensor, "n_grains d"]:
-        return self.effects(state, self.graph(state))
+        if self.tile_grains is None or len(state.pos) <= self.tile_grains:
+            return self.effects(state, self.graph(state))
+        total = self.scale.new_empty(len(state.pos), len(self.scale))
+        for core, region in tiles(state.pos.detach(), self.tile_grains, self.halo_m):
+            near = state.pick(region)
+            total[core] = self.effects(near, self.graph(near))[torch.searchsorted(region, core)]
+        return total
 
     def effects(self, state: State, graph: Graph) -> Float[Tensor, "n_grains d"]:
         """What the contacts of `graph` add, over `scale`; 0 for a grain without an edge."""
@@ -108,6 +116,12 @@ class Simulator(nn.Module):
             edges = features.wall_edges(state, graph, graph.walls, **options).to(self.scale.dtype)
             total = total + self.wall_network(self._wall_features(graph.walls), grains, edges, graph.wall_edges)
         return total
+
+    @property
+    def halo_m(self) -> float:
+        """How far away a grain can be and still have a part in another's next step: a cutoff per round of message
+        passing, and one for who can touch it."""
+        return (self.config.layers + self.requires.free_grains) * self.cutoff_m * (1 + 1e-9)
 
     @property
     def cutoff_m(self) -> float:

@@ -22,6 +22,8 @@ class TrainingConfig:
         unroll: half of the updates start from up to this many of the model's own steps; 0 is one-step training.
         unroll_from: share of the updates after which unrolling begins.
         gradient_clip: largest gradient norm; 0 is no limit.
+        region_grains: an update looks at this many neighbouring grains of each window only, so that its memory
+            does not grow with the scene; null looks at all.
         average_decay: the weights' exponential moving average with this decay is what is judged and saved; 0 is none.
     """
 
@@ -35,6 +37,7 @@ class TrainingConfig:
     unroll: int = MISSING
     unroll_from: float = MISSING
     gradient_clip: float = MISSING
+    region_grains: int | None = None
     average_decay: float = MISSING
 
     def __post_init__(self) -> None:
@@ -44,6 +47,8 @@ class TrainingConfig:
         for key in ("seed", "halvings", "noise_radii", "noise_velocity", "unroll", "unroll_from", "gradient_clip"):
             value = getattr(self, key)
             require(value >= 0, f"training.{key}", value, "at least 0", f"training.{key}=0 turns it off")
+        region = self.region_grains
+        require(region is None or region > 0, "training.region_grains", region, "at least 1", "null takes all grains")
         decay = self.average_decay
         require(0 <= decay < 1, "training.average_decay", decay, "0 up to below 1", "e.g. 0.998; 0 is no averaging")
 

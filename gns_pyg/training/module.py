@@ -11,6 +11,7 @@ from torch import Tensor
 from torch.optim.swa_utils import AveragedModel, get_ema_multi_avg_fn
 
 from gns_pyg.dynamics.simulator import Simulator
+from gns_pyg.dynamics.tiles import ball
 from gns_pyg.errors import ConfigError, NumericalError
 from gns_pyg.scene.symmetry import symmetry
 from gns_pyg.state import State, Window
@@ -76,9 +77,14 @@ class TrainingModule(pl.LightningModule):
             for _ in range(self._own_steps(random)):
                 state, frame = self.simulator(state), frame + 1
         following = self.simulator.integrator.read(window, frame + 1)
-        error = self.simulator.correction(state) - self.simulator.target(state, following)
+        counted = torch.ones_like(state.batch, dtype=torch.bool)
         if window.active is not None and state.active is not None:  # a grain that just entered has no difference yet
-            error = error[state.active & window.active[frame - 1 : frame + 2].all(dim=0)]
+            counted = state.active & window.active[frame - 1 : frame + 2].all(dim=0)
+        if self.config.region_grains is not None:
+            core, region = ball(state.pos, state.batch, self.config.region_grains, self.simulator.halo_m, random)
+            counted = (counted & torch.zeros_like(counted).index_fill(0, core, True))[region]
+            state, following = state.pick(region), following.pick(region)
+        error = (self.simulator.correction(state) - self.simulator.target(state, following))[counted]
         loss = error.square().sum() / max(error.numel(), 1)  # 0 where nobody is there
         if not torch.isfinite(loss):
             raise NumericalError(
