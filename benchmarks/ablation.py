@@ -97,7 +97,7 @@ def main() -> None:
 def table(rows: list[dict[str, Any]]) -> str:
     """The results as Markdown."""
     lines = [f"| {' | '.join(['scene', 'variant', 'updates', *FIGURES])} |", "|---" * (3 + len(FIGURES)) + "|"]
-    for row in rows:
+    for row in sorted(rows, key=lambda row: list(VARIANTS).index(row["scene"])):
         cells = [row["scene"], row["variant"], str(row["updates"]), *figures(row["metrics"])]
         lines.append(f"| {' | '.join(cells)} |")
     return "\n".join(lines)
