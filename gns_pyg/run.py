@@ -22,6 +22,7 @@ from gns_pyg.data.coverage import coverage, outside_coverage, values
 from gns_pyg.data.datamodule import DataConfig, DataModule, Split, open_case, open_cases, split
 from gns_pyg.data.statistics import measure
 from gns_pyg.data.trajectory import Trajectory
+from gns_pyg.dynamics.execution import Execution
 from gns_pyg.dynamics.integrator import Integrator
 from gns_pyg.dynamics.model_config import ModelConfig
 from gns_pyg.dynamics.simulator import Simulator
@@ -185,8 +186,13 @@ def load_bundle(cfg: DictConfig) -> Simulator:
     require(
         cfg.bundle is not None, "bundle", "null", "a bundle folder", "bundle=runs/.../bundle, as train.py prints it"
     )
+    execution, where = typed(Execution, cfg.execution, "execution"), device(cfg)
+    execution.check(where)
+    torch.set_float32_matmul_precision("high" if execution.precision == "tf32" else "highest")
     scene = Scene.from_config(cfg.scene) if cfg.get("scene") else None
-    return bundle.load(cfg.bundle, scene).to(device(cfg))
+    simulator = bundle.load(cfg.bundle, scene).to(where)
+    simulator.execution = execution
+    return simulator
 
 
 def device(cfg: DictConfig) -> torch.device:
@@ -208,7 +214,10 @@ def report(
         write_json(folder / "metrics.json", {})
         return {}
     evaluation = judge(simulator, cases, expected, cfg.start_s)
-    metrics = evaluation.metrics | {"speed/threads": torch.get_num_threads(), "speed/device": device_name(simulator)}
+    metrics = evaluation.metrics | {
+        "speed/threads": torch.get_num_threads(),
+        "speed/device": device_name(simulator.scale.device),
+    }
     write_json(folder / "metrics.json", metrics)
     write_json(folder / "cases.json", evaluation.per_case)
     figures = write_plots(evaluation, scene, folder / "plots")
@@ -220,9 +229,8 @@ def report(
     return metrics
 
 
-def device_name(simulator: Simulator) -> str:
-    """The GPU or processor that a simulator computes on."""
-    where = simulator.scale.device
+def device_name(where: torch.device) -> str:
+    """The GPU's or processor's name."""
     return torch.cuda.get_device_name(where) if where.type == "cuda" else machine.processor()
 
 

@@ -1,6 +1,7 @@
 """State in, next state out: the only code that training, roll-out and evaluation share."""
 
 from collections.abc import Mapping
+from contextlib import nullcontext
 from dataclasses import replace
 from typing import Any
 
@@ -9,6 +10,7 @@ from jaxtyping import Bool, Float, Int
 from torch import Tensor, nn
 
 from gns_pyg.dynamics.boundary import Boundary
+from gns_pyg.dynamics.execution import Execution
 from gns_pyg.dynamics.free_grains import among, can_touch
 from gns_pyg.dynamics.integrator import Integrator
 from gns_pyg.dynamics.model_config import ModelConfig
@@ -50,7 +52,8 @@ class Simulator(nn.Module):
         self.integrator = Integrator(scene, requires.state, free_flight=requires.free_flight)
         scale = torch.tensor(statistics.correction).repeat_interleave(3)
         self.register_buffer("scale", scale, persistent=False)
-        self.tile_grains: int | None = None  # more grains than this are computed tile by tile, with the same result
+        self.execution = Execution()
+        self.edges_done = 0  # edges that went through the networks so far
         self._conditions = [PARAMETERS.index(name) for name in requires.material_features]
 
         width: dict[str, Any] = dict(
@@ -78,7 +81,11 @@ class Simulator(nn.Module):
 
     def forward(self, state: State) -> State:
         """Moves every grain by one frame."""
-        after = self.integrator.integrate(state, self.correction(state) * self.scale)
+        return self.advance(state, self.correction(state))
+
+    def advance(self, state: State, correction: Float[Tensor, "n_grains d"]) -> State:
+        """The next state, given what contacts add."""
+        after = self.integrator.integrate(state, correction * self.scale)
         return after if self.passage is None else self.passage(state, after)
 
     def target(self, state: State, following: State) -> Float[Tensor, "n_grains d"]:
@@ -94,16 +101,18 @@ class Simulator(nn.Module):
         return there.new_zeros(len(state.pos), there.shape[1]).masked_scatter(state.active[:, None], there)
 
     def _contacts(self, state: State) -> Float[Tensor, "n_grains d"]:
-        if self.tile_grains is None or len(state.pos) <= self.tile_grains:
+        most = self.execution.tile_grains
+        if most is None or len(state.pos) <= most:
             return self.effects(state, self.graph(state))
         total = self.scale.new_empty(len(state.pos), len(self.scale))
-        for core, region in tiles(state.pos.detach(), self.tile_grains, self.halo_m):
+        for core, region in tiles(state.pos.detach(), most, self.halo_m):
             near = state.pick(region)
             total[core] = self.effects(near, self.graph(near))[torch.searchsorted(region, core)]
         return total
 
     def effects(self, state: State, graph: Graph) -> Float[Tensor, "n_grains d"]:
         """What the contacts of `graph` add, over `scale`; 0 for a grain without an edge."""
+        self.edges_done += graph.grain_edges.shape[1] + graph.wall_edges.shape[1]
         grains = self._grain_features(state)
         options: dict[str, Any] = dict(
             velocity_m_s=self.statistics.velocity_m_s,
@@ -111,10 +120,13 @@ class Simulator(nn.Module):
             contact=self.config.contact_features,
         )
         edges = features.grain_edges(state, graph, **options).to(self.scale.dtype)
-        total = self.grain_network(None, grains, edges, graph.grain_edges)
-        if self.wall_network is not None and graph.walls is not None:
-            edges = features.wall_edges(state, graph, graph.walls, **options).to(self.scale.dtype)
-            total = total + self.wall_network(self._wall_features(graph.walls), grains, edges, graph.wall_edges)
+        where, cast = self.scale.device.type, self.execution.autocast
+        with torch.autocast(where, cast) if cast else nullcontext():
+            total = self.grain_network(None, grains, edges, graph.grain_edges).to(self.scale.dtype)
+            if self.wall_network is not None and graph.walls is not None:
+                edges = features.wall_edges(state, graph, graph.walls, **options).to(self.scale.dtype)
+                points = self._wall_features(graph.walls)
+                total = total + self.wall_network(points, grains, edges, graph.wall_edges).to(self.scale.dtype)
         return total
 
     @property

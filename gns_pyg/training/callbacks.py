@@ -8,6 +8,7 @@ from typing import cast
 
 import numpy as np
 import pytorch_lightning as pl
+import torch
 from tqdm import tqdm
 
 from gns_pyg.config import require
@@ -45,6 +46,35 @@ class Progress(pl.Callback):
     def on_train_end(self, trainer: pl.Trainer, module: pl.LightningModule) -> None:
         if self.bar is not None:
             self.bar.close()
+
+
+class Throughput(pl.Callback):
+    """Logs `train/graphs_per_s` (windows that made a gradient) and `train/edges_per_s` (edges through the networks, those
+    of the simulator's own steps too) since the last log, validation roll-outs left out.
+
+    Args:
+        every_n_updates: how often.
+    """
+
+    def __init__(self, every_n_updates: int) -> None:
+        key = "callbacks.throughput.every_n_updates"
+        require(every_n_updates > 0, key, every_n_updates, "at least 1", "e.g. 100")
+        self.every_n_updates, self.seconds, self.graphs, self.edges = every_n_updates, 0.0, 0, 0
+
+    def on_train_batch_start(self, trainer: pl.Trainer, module: pl.LightningModule, batch, batch_idx) -> None:
+        self.started, self.before = time.perf_counter(), cast(TrainingModule, module).simulator.edges_done
+
+    def on_train_batch_end(self, trainer: pl.Trainer, module: pl.LightningModule, outputs, batch, batch_idx) -> None:
+        if module.device.type == "cuda":
+            torch.cuda.synchronize(module.device)
+        self.seconds += time.perf_counter() - self.started
+        self.graphs += batch.time_s.shape[0]
+        self.edges += cast(TrainingModule, module).simulator.edges_done - self.before
+        if trainer.global_step % self.every_n_updates == 0:
+            rates = {"graphs": self.graphs / self.seconds, "edges": self.edges / self.seconds}
+            for logger in trainer.loggers:
+                logger.log_metrics({f"train/{k}_per_s": v for k, v in rates.items()}, step=trainer.global_step)
+            self.seconds, self.graphs, self.edges = 0.0, 0, 0
 
 
 class RolloutMetrics(pl.Callback):

@@ -3,9 +3,9 @@
 import pytest
 import torch
 
+from gns_pyg.dynamics.execution import Execution
 from gns_pyg.dynamics.tiles import ball, tiles
 from tests import scenes, simulators
-
 
 NARROW = {"kind": "box", "size_m": [0.26, 0.26, 0.26], "center_m": [0.0, 0.0, 0.0]}
 WALLS = {"walls": {"shape": NARROW, "points": 1500, "friction_angle_rad": 0.5}}
@@ -52,7 +52,7 @@ def test_tiles_give_the_same_step(changes, most) -> None:
     state = simulators.state_in_box([120, 90], half_m=0.12, spin=model.requires.state == "full")
     with torch.inference_mode():
         whole = model(state)
-        model.tile_grains = most
+        model.execution = Execution(tile_grains=most)
         tiled = model(state)
     for field in ("pos", "vel", "ang_vel"):
         if getattr(whole, field) is not None:
