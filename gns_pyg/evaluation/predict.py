@@ -1,7 +1,9 @@
 """Running a simulator against a recorded case."""
 
 import time
+from collections import deque
 from collections.abc import Callable
+from concurrent.futures import Future, ThreadPoolExecutor
 from dataclasses import asdict
 from importlib.metadata import version
 from pathlib import Path
@@ -18,6 +20,8 @@ from gns_pyg.dynamics.simulator import Simulator
 from gns_pyg.errors import DataError
 from gns_pyg.evaluation.errors import position_error
 from gns_pyg.state import State, Window
+
+MOST_WAITING = 8  # frames that may wait to be written
 
 
 def start_frame(trajectory: Trajectory, start_s: Any) -> int:
@@ -48,6 +52,8 @@ def initial_state(simulator: Simulator, trajectory: Trajectory, frame: int) -> S
 def write_rollout(simulator: Simulator, trajectory: Trajectory, start: int, path: Path) -> float:
     """Rolls out from the recorded frame `start` and writes every frame to `path`, in the data's own schema.
 
+    A thread of its own writes while the next frames are computed.
+
     Returns:
         Wall seconds per simulated second, without the writing.
     """
@@ -59,13 +65,24 @@ def write_rollout(simulator: Simulator, trajectory: Trajectory, start: int, path
     stored = {key: n for key, n in scene.dem.decimals.items() if key != "angular_velocity" or state.ang_vel is not None}
     of_case = asdict(scene) | {key: trajectory.scene[key] for key in ("grains", "damping")}  # they may vary
     radius, mass, absence = trajectory.radius, trajectory.mass, state.active is not None
-    with TrajectoryWriter(path, of_case, radius, mass, trajectory.boundary, stored, absence) as writer:
+    with (
+        TrajectoryWriter(path, of_case, radius, mass, trajectory.boundary, stored, absence) as writer,
+        ThreadPoolExecutor(1) as pool,
+    ):
+        waiting: deque[Future[None]] = deque()
 
         def write(step: int, state: State) -> None:
             spin, active = (None if field is None else field.numpy() for field in (state.ang_vel, state.active))
             writer.append(step, float(state.time_s[0]), state.pos.numpy(), state.vel.numpy(), spin, active)
 
-        seconds = _run(simulator, state, n_steps, write)
+        def hand_over(step: int, state: State) -> None:
+            waiting.append(pool.submit(write, step, state))
+            if len(waiting) > MOST_WAITING:
+                waiting.popleft().result()
+
+        seconds = _run(simulator, state, n_steps, hand_over)
+        for frame in waiting:
+            frame.result()
         writer.finish(
             {
                 "wall_clock_s": seconds,
