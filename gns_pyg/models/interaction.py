@@ -50,18 +50,18 @@ class Interaction(MessagePassing):
         size = (senders.shape[0], receivers.shape[0])
         nodes = (self.from_sender(senders), self.from_receiver(receivers))
         if len(edges) == 1:
-            messages = [self.edge_updater(edge_index[0], x=nodes, edge=self.from_edge(edges[0]), size=size)]
-            received = self.propagate(edge_index[0], messages=messages[0], size=size)
+            messages = self.edge_updater(edge_index[0], x=nodes, edge=self.from_edge(edges[0]), size=size)
+            received = self.propagate(edge_index[0], messages=messages, size=size)
+            after = [edges[0] + messages if self.skip else messages]
         else:
-            messages, received = [], torch.zeros_like(receivers)
-            for block, (sender, receiver) in zip(edges, edge_index, strict=True):
+            received, after = torch.zeros_like(receivers), []
+            for edge, (sender, receiver) in zip(edges, edge_index, strict=True):
                 ends = nodes[0].index_select(0, sender), nodes[1].index_select(0, receiver)
-                messages.append(self.edge_update(*ends, self.from_edge(block)))
-                received.index_add_(0, receiver, messages[-1].to(received.dtype))  # sums stay in full precision
+                messages = self.edge_update(*ends, self.from_edge(edge))
+                received.index_add_(0, receiver, messages.to(received.dtype))  # sums stay in full precision
+                after.append(edge + messages if self.skip else messages)
         updated = self.update_mlp(torch.cat([receivers, received], dim=1))
-        if not self.skip:
-            return updated, messages
-        return receivers + updated, [edge + message for edge, message in zip(edges, messages, strict=True)]
+        return receivers + updated if self.skip else updated, after
 
     def edge_update(self, x_j: Tensor, x_i: Tensor, edge: Tensor) -> Tensor:
         return self.message_mlp((x_i + x_j).add_(edge).relu_())
