@@ -15,7 +15,7 @@ from torch import Tensor
 AnyRecord = TypeVar("AnyRecord", bound="Record")
 
 
-def constant(values: Sequence[float], like: Tensor) -> Tensor:
+def constant(values: Sequence[float | int], like: Tensor) -> Tensor:
     """`values` with the dtype and on the device of `like`, (len(values),); nothing is copied from the host, so a CUDA
     graph can hold it."""
     return torch.stack([like.new_full((), value) for value in values])

@@ -146,14 +146,17 @@ class Simulator(nn.Module):
         reach = self.config.cutoff_grain_radii * (state.radius[sender] + state.radius[receiver]) / 2
         return (state.pos[sender] - state.pos[receiver]).square().sum(1) <= reach.square()
 
-    def graph(self, state: State) -> Graph:
-        """Who can touch whom within the cutoffs. Not differentiable."""
-        state = replace(state, pos=state.pos.detach(), vel=state.vel.detach())
+    def pairs_in_reach(self, state: State) -> Int[Tensor, "2 e"]:
+        """Every [sender, receiver] within its cutoff."""
         index = backend(self.config.neighbors, state.pos.device).build(state.pos, state.batch)
         search = index if self.config.self_loops else pairs(index)
         edges = search(state.pos, state.batch, self.cutoff_m)
-        if len(self.scene.grains.radii_m) > 1:
-            edges = edges[:, self.in_reach(state, edges)]
+        return edges if len(self.scene.grains.radii_m) == 1 else edges[:, self.in_reach(state, edges)]
+
+    def graph(self, state: State) -> Graph:
+        """Who can touch whom within the cutoffs. Not differentiable."""
+        state = replace(state, pos=state.pos.detach(), vel=state.vel.detach())
+        edges = self.pairs_in_reach(state)
         graph = Graph(edges, edges.new_empty(2, 0))
         if self.boundary is not None:
             walls, contacts = self.boundary.contacts(state)

@@ -15,6 +15,7 @@ import torch
 from gns_pyg.config import require
 from gns_pyg.data.trajectory import Trajectory, TrajectoryWriter
 from gns_pyg.data.windows import read_window
+from gns_pyg.dynamics.captured import Captured
 from gns_pyg.dynamics.rollout import rollout
 from gns_pyg.dynamics.simulator import Simulator
 from gns_pyg.errors import DataError
@@ -118,12 +119,13 @@ def roll_out(simulator: Simulator, trajectory: Trajectory, start: int) -> tuple[
 def _run(simulator: Simulator, state: State, n_steps: int, see: Callable[[int, State], None]) -> float:
     """Shows `see` the state and the `n_steps` that follow it, on the CPU; returns the wall seconds of the roll-out."""
     see(0, state)
-    states, seconds = rollout(simulator, state.to(simulator.scale.device), n_steps), 0.0
-    for step in range(1, n_steps + 1):
+    step = Captured(simulator) if simulator.execution.capture else simulator
+    states, seconds = rollout(step, state.to(simulator.scale.device), n_steps), 0.0
+    for number in range(1, n_steps + 1):
         begin = time.perf_counter()
         following = next(states).to("cpu")
         seconds += time.perf_counter() - begin
-        see(step, following)
+        see(number, following)
     return seconds
 
 

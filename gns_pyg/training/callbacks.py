@@ -49,8 +49,8 @@ class Progress(pl.Callback):
 
 
 class Throughput(pl.Callback):
-    """Logs `train/graphs_per_s` (windows that made a gradient) and `train/edges_per_s` (edges through the networks, also
-    in the simulator's own steps) since the last log, validation roll-outs left out.
+    """Logs `train/graphs_per_s` (windows that made a gradient) and `train/edges_per_s` (edges through the networks,
+    in the simulator's own steps too) since the last log, validation roll-outs left out.
 
     Args:
         every_n_updates: how often.

@@ -1,0 +1,129 @@
+"""Where a step's time goes: `python -m benchmarks.phases [copies ...]`.
+
+Steps an untrained simulator of the paper's width from a recorded state of the full-size drum (generate its case 0
+first), on one thread, and writes benchmarks/results/phases.json: medians of the milliseconds of every phase. More
+copies of the drum are batched as graphs of their own.
+"""
+
+import json
+import sys
+import time
+from collections import defaultdict
+from collections.abc import Callable
+from pathlib import Path
+from statistics import median
+from typing import Any
+from unittest.mock import patch
+
+import torch
+from hydra import compose, initialize_config_dir
+
+from gns_pyg import machine, run
+from gns_pyg.config import CONF, typed
+from gns_pyg.data.datamodule import Split, find_cases, open_case
+from gns_pyg.data.windows import read_window
+from gns_pyg.dynamics import simulator as steps
+from gns_pyg.dynamics.boundary import BoundaryPart
+from gns_pyg.dynamics.integrator import Integrator
+from gns_pyg.dynamics.model_config import ModelConfig
+from gns_pyg.dynamics.simulator import Simulator
+from gns_pyg.graph import features
+from gns_pyg.models.contact_network import ContactNetwork
+from gns_pyg.scene.requirements import Requires, resolve
+from gns_pyg.scene.scene import Scene
+from gns_pyg.state import Window
+
+OUT = Path(__file__).parent / "results" / "phases.json"
+PHASES: dict[str, list[tuple[Any, str]]] = {
+    "neighbour search": [(Simulator, "pairs_in_reach"), (BoundaryPart, "within")],
+    "walls placed": [(BoundaryPart, "at")],
+    "who flies free": [(steps, "can_touch"), (steps, "among")],
+    "features": [
+        (features, "grain_edges"),
+        (features, "wall_edges"),
+        (Simulator, "_grain_features"),
+        (Simulator, "_wall_features"),
+    ],
+    "networks": [(ContactNetwork, "forward")],
+    "integration": [(Integrator, "integrate")],
+}
+ROUNDS, FRAME = 9, 150
+
+
+def main() -> None:
+    torch.set_num_threads(1)
+    rows = [profile(int(copies)) for copies in sys.argv[1:] or (1, 10, 100)]
+    OUT.write_text(json.dumps({"machine": machine.processor(), "rows": rows}, indent=1) + "\n")
+    print(table(rows))
+
+
+@torch.inference_mode()
+def profile(copies: int) -> dict[str, Any]:
+    simulator, state = paper_wide("drum", FRAME, copies)
+    seconds: dict[str, list[float]] = defaultdict(list)
+    walls: list[float] = []
+    for _ in range(max(3, ROUNDS // copies) + 1):
+        spent: dict[str, float] = defaultdict(float)
+        patches = [
+            patch.object(owner, name, timed(getattr(owner, name), spent, phase)) for phase, owner, name in hooks()
+        ]
+        for change in patches:
+            change.start()
+        begin = time.perf_counter()
+        simulator(state)
+        walls.append(time.perf_counter() - begin)
+        for change in patches:
+            change.stop()
+        for phase in PHASES:
+            seconds[phase].append(spent[phase])
+    row: dict[str, Any] = {"grains": len(state.pos), "edges": n_edges(simulator, state)}
+    row["step_ms"] = round(1e3 * median(walls[1:]), 2)
+    for phase, values in seconds.items():
+        row[f"{phase}, ms"] = round(1e3 * median(values[1:]), 2)
+    return row
+
+
+def hooks() -> list[tuple[str, Any, str]]:
+    return [(phase, owner, name) for phase, places in PHASES.items() for owner, name in places]
+
+
+def timed(function: Callable, spent: dict[str, float], phase: str) -> Callable:
+    def call(*args: Any, **kwargs: Any) -> Any:
+        begin = time.perf_counter()
+        result = function(*args, **kwargs)
+        spent[phase] += time.perf_counter() - begin
+        return result
+
+    return call
+
+
+def paper_wide(name: str, frame: int, copies: int, **changes: Any) -> tuple[Simulator, Any]:
+    """An untrained simulator of width 128 and a recorded state of a scene, `copies` times."""
+    with initialize_config_dir(CONF, version_base="1.3"):
+        config = compose("train", [f"scene={name}", "model.hidden=128"])
+    scene = Scene.from_config(config.scene)
+    case = open_case(find_cases(scene, None)[0], scene)
+    requires = resolve(scene, {}, Requires(**changes))
+    model = typed(ModelConfig, config.model, "model")
+    simulator = run.build(scene, model, requires, Split([case], [], []), seed=0).eval()
+    window = Window.collate([read_window(case, frame, 2)] * copies)
+    return simulator, simulator.integrator.read(window, 1)
+
+
+def n_edges(simulator: Simulator, state: Any) -> int:
+    graph = simulator.graph(state)
+    return graph.grain_edges.shape[1] + graph.wall_edges.shape[1]
+
+
+def table(rows: list[dict[str, Any]]) -> str:
+    """The results as Markdown: milliseconds, and shares of the step."""
+    lines = ["| grains | edges | step, ms | " + " | ".join(PHASES) + " | rest |", "|---" * (4 + len(PHASES)) + "|"]
+    for row in rows:
+        spent = [row[f"{phase}, ms"] for phase in PHASES]
+        cells = [f"{ms:.1f} ({ms / row['step_ms']:.0%})" for ms in [*spent, row["step_ms"] - sum(spent)]]
+        lines.append(f"| {row['grains']:,} | {row['edges']:,} | {row['step_ms']:.0f} | {' | '.join(cells)} |")
+    return "\n".join(lines)
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,83 @@
+"""Full-size roll-outs against Yade on the same two cores: `python -m benchmarks.rollout`.
+
+Yade runs a case of the paper's hopper and drum with two threads, at the paper's 1e-5 s and at its largest step that
+still gives the same observables (`scene.dem.dt_s=auto`); both files are kept in $GNS_DATA/rollout_benchmark. Then every
+bundle of MODELS rolls the second one out, on two threads, and is judged against it. Writes
+benchmarks/results/rollout.json. The bundles are trained on the reduced scenes first, for example
+
+    python train.py scene=hopper_small model.hidden=128 hydra.run.dir=runs/speed/hopper_128
+"""
+
+import json
+import logging
+import os
+from pathlib import Path
+from typing import Any
+
+import torch
+from hydra import compose, initialize_config_dir
+
+from benchmarks.ablation import FIGURES, figures
+from data_gen.generate import generate
+from gns_pyg import machine, run
+from gns_pyg.config import CONF
+from gns_pyg.data.trajectory import Trajectory
+
+OUT = Path(__file__).parent / "results" / "rollout.json"
+DATA = Path(os.environ.get("GNS_DATA", "data")) / "rollout_benchmark"
+STEPS = {"1e-5": "1e-5", "equivalent": "auto"}
+MODELS = {"paper's width": "128", "default": "64", "fast": "fast"}
+CASE, THREADS = 40, 2
+
+
+def main() -> None:
+    torch.set_num_threads(THREADS)
+    logging.basicConfig(level=logging.WARNING, format="%(message)s")
+    found: dict[str, Any] = {"machine": machine.processor(), "threads": THREADS}
+    for scene in ("hopper", "drum"):
+        yade = {name: yade_seconds(scene, name, step) for name, step in STEPS.items()}
+        rows = [judged(scene, name, folder, yade) for name, folder in MODELS.items()]
+        factors = {f"factor_yade_{step}": rows[0][f"factor_yade_{step}"] for step in STEPS}
+        found[scene] = factors | {"yade_seconds_per_simulated_second": yade, "models": rows}
+        OUT.write_text(json.dumps(found, indent=1) + "\n")
+    print(table(found))
+
+
+def yade_seconds(scene: str, name: str, step: str) -> float:
+    """Wall seconds per simulated second."""
+    out = [f"scene={scene}", f"case={CASE}", f"scene.dem.dt_s={step}", f"cores={THREADS}", f"out={DATA}/{scene}_{name}"]
+    case = Trajectory(generate(config("generate", *out)))
+    return case.run["wall_clock_s"] / (case.times_s[-1] - case.times_s[0])
+
+
+def judged(scene: str, name: str, folder: str, yade: dict[str, float]) -> dict[str, Any]:
+    """One bundle on the equivalent run."""
+    bundle = Path("runs/speed") / f"{scene}_{folder}"
+    places = [f"bundle={bundle}/bundle", f"folder={bundle}/full_size", f"data.dir={DATA}/{scene}_equivalent"]
+    metrics = run.evaluate(config("evaluate", *places, f"scene={scene}"))
+    seconds = metrics["speed/seconds_per_simulated_second"]
+    row = {"model": name, "seconds_per_simulated_second": seconds}
+    row |= {f"factor_yade_{step}": round(of_yade / seconds, 2) for step, of_yade in yade.items()}
+    return row | {"metrics": metrics}
+
+
+def config(name: str, *overrides: str) -> Any:
+    with initialize_config_dir(CONF, version_base="1.3"):
+        return compose(name, list(overrides))
+
+
+def table(found: dict[str, Any]) -> str:
+    """The results as Markdown."""
+    columns = ["scene", "model", "s per simulated s", "times Yade at 1e-5 s", "times Yade, largest step", *FIGURES]
+    lines = [f"| {' | '.join(columns)} |", "|---" * len(columns) + "|"]
+    for scene in ("hopper", "drum"):
+        for step, seconds in found[scene]["yade_seconds_per_simulated_second"].items():
+            lines.append(f"| {scene} | Yade, step {step} | {seconds:.1f} |" + " |" * (len(columns) - 3))
+        for row in found[scene]["models"]:
+            speeds = [f"{row['seconds_per_simulated_second']:.2f}", *(f"{row[f'factor_yade_{s}']:.1f}" for s in STEPS)]
+            lines.append(f"| {' | '.join([scene, row['model'], *speeds, *figures(row['metrics'])])} |")
+    return "\n".join(lines)
+
+
+if __name__ == "__main__":
+    main()
