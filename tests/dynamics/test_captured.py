@@ -95,3 +95,15 @@ def test_a_cuda_graph_can_hold_the_step(scene) -> None:
         captured(state)
         with Capturable():
             captured.step(state)
+
+
+@pytest.mark.parametrize("scene", SCENES)
+def test_the_step_needs_no_value_and_stays_on_its_device(scene) -> None:
+    """The meta device has shapes only: an operation that reads a value or mixes devices fails there."""
+    model, state = model_and_state(scene, [90])
+    captured = Captured(model.to("meta"))
+    captured.capacities = [300] * len(captured.capacities)
+    with torch.inference_mode():
+        after, needed = captured.step(state.to("meta"))
+    assert after.pos.device.type == needed.device.type == "meta"
+    assert after.pos.shape == state.pos.shape
