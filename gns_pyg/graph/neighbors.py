@@ -71,24 +71,37 @@ def pairs(index: Index) -> Index:
     return search
 
 
-def _sorted(edges: Tensor, n_points: int) -> Tensor:
-    return edges[:, torch.argsort(edges[1] * n_points + edges[0])]
+def _key(query: Tensor, point: Tensor, n_points: int) -> Tensor:
+    """A pair as one number, so that sorting numbers sorts pairs: faster than an argsort of two."""
+    return query << n_points.bit_length() | point
+
+
+def _edges(key: Tensor, n_points: int) -> Tensor:
+    """Sorted [point, query] of keys."""
+    key, bits = key.sort().values, n_points.bit_length()
+    return torch.stack([key & (1 << bits) - 1, key >> bits])
 
 
 def _kdtree(points: Tensor, point_batch: Tensor) -> Index:
     """SciPy's k-d tree, one per graph."""
     rows = _rows_per_graph(point_batch)
-    trees = {graph: cKDTree(points[where].numpy()) for graph, where in rows.items()}
+    trees = {graph: cKDTree(points[where].numpy(), balanced_tree=False) for graph, where in rows.items()}
 
     def index(query: Tensor, query_batch: Tensor, radius: float) -> Tensor:
-        found = [torch.empty(2, 0, dtype=torch.long)]
+        found = [query_batch.new_empty(0)]
+        if query is points and query_batch is point_batch:  # each pair once, then the other way round: half the time
+            for graph, where in rows.items():
+                half = torch.from_numpy(trees[graph].query_pairs(radius, output_type="ndarray"))
+                one, other = where[half.T]
+                found += [_key(one, other, len(points)), _key(other, one, len(points)), _key(where, where, len(points))]
+            return _edges(torch.cat(found), len(points))
         for graph, where in _rows_per_graph(query_batch).items():
             if graph in trees:
-                other = cKDTree(query[where].numpy())
-                near = trees[graph].sparse_distance_matrix(other, radius, output_type="ndarray")
-                point, asking = torch.from_numpy(near["i"].copy()), torch.from_numpy(near["j"].copy())
-                found.append(torch.stack([rows[graph][point], where[asking]]))
-        return _sorted(torch.cat(found, 1), len(points))
+                asking = cKDTree(query[where].numpy(), balanced_tree=False)
+                near = trees[graph].sparse_distance_matrix(asking, radius, output_type="ndarray")
+                point, row = (torch.from_numpy(near[end].copy()) for end in "ij")
+                found.append(_key(where[row], rows[graph][point], len(points)))
+        return _edges(torch.cat(found), len(points))
 
     return index
 
@@ -161,7 +174,7 @@ def fixed_pairs(
     query, query_batch = query[asking], query_batch[asking]
     first, count = _ranges(hashed, query, query_batch)
     row, point, near = _candidates(hashed, query, query_batch, first, count, candidate_capacity)
-    key = _only(asking[row] << n.bit_length() | point, near, capacity, m << n.bit_length() | n)
+    key = _only(_key(asking[row], point, n), near, capacity, m << n.bit_length() | n)
     return _edges(key, n), near.sum(), count.sum()
 
 
@@ -181,7 +194,7 @@ def _grid(points: Tensor, point_batch: Tensor) -> Index:
             asked = query[asking], query_batch[asking]
             first, count = _ranges(grid, *asked)
             row, point, near = _candidates(grid, *asked, first, count, int(count.sum()))
-            found.append(_only(asking[row] << n.bit_length() | point, near, int(near.sum()), 0))
+            found.append(_only(_key(asking[row], point, n), near, int(near.sum()), 0))
         return _edges(torch.cat(found), n)
 
     return index
@@ -254,25 +267,21 @@ def _only(key: Tensor, near: Tensor, capacity: int, unused: int) -> Tensor:
     return torch.full((capacity + 1,), unused, device=key.device).scatter_(0, at, key)[:-1]
 
 
-def _edges(key: Tensor, n_points: int) -> Tensor:
-    """Sorted [point, query] of keys `query << bits | point`."""
-    key, bits = key.sort().values, n_points.bit_length()
-    return torch.stack([key & (1 << bits) - 1, key >> bits])
-
-
 CLUSTER_LIMIT = 512
 
 
 def _torch_cluster(points: Tensor, point_batch: Tensor) -> Index:
-    """torch_cluster's radius search. It caps the neighbours of a query; reaching the cap is an error here."""
+    """torch_cluster's radius search, built anew each time; it caps the neighbours; reaching the cap is an error."""
     from torch_cluster import radius as search
+
+    points = points.double()  # it subtracts in the points' own precision
 
     def index(query: Tensor, query_batch: Tensor, radius: float) -> Tensor:
         if len(points) == 0 or len(query) == 0:
             return torch.empty(2, 0, dtype=torch.long, device=query.device)
-        within = nextafter(radius, inf)  # it asks for less than the radius, and in the points' own precision
+        within = nextafter(radius, inf)  # it wants less than this, not at most
         asking, point = search(
-            points.double(), query.double(), within, point_batch, query_batch, max_num_neighbors=CLUSTER_LIMIT
+            points, query.double(), within, point_batch, query_batch, max_num_neighbors=CLUSTER_LIMIT
         )
         most = int(torch.bincount(asking).max()) if len(asking) else 0
         if most >= CLUSTER_LIMIT:
@@ -282,7 +291,7 @@ def _torch_cluster(points: Tensor, point_batch: Tensor) -> Index:
                 f"fewer than {CLUSTER_LIMIT}",
                 "lower the cutoff or set model.neighbors=grid, which has no limit",
             )
-        return _sorted(torch.stack([point, asking]), len(points))
+        return _edges(_key(asking, point, len(points)), len(points))
 
     return index
 
@@ -296,11 +305,14 @@ def _torch_cluster_has_cuda() -> bool:
     return torch.ops.torch_cluster.cuda_version() >= 0
 
 
+# Fastest first. On a CPU the k-d tree leads at every size, self and wall search taken together, and torch_cluster falls
+# behind the grid beyond 25,000 points (benchmarks/results/neighbors.json). On CUDA (not measured), the grid is first:
+# its work grows with the points, torch_cluster's with their square.
 BACKENDS = {
     b.name: b
     for b in (
         Backend("kdtree", _kdtree, cpu=True, cuda=lambda: False),
-        Backend("torch_cluster", _torch_cluster, cpu=True, cuda=_torch_cluster_has_cuda, package="torch_cluster"),
         Backend("grid", _grid, cpu=True, cuda=lambda: True),
+        Backend("torch_cluster", _torch_cluster, cpu=True, cuda=_torch_cluster_has_cuda, package="torch_cluster"),
     )
 }

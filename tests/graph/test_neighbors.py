@@ -54,8 +54,10 @@ def test_equals_brute_force(name, n, m, n_graphs, seed, radius, shift):
     points, point_batch = cloud(n, n_graphs, seed)
     query, query_batch = cloud(m, n_graphs, seed + 1)
     points, query = points + shift, query + shift
-    edges = BACKENDS[name].build(points, point_batch)(query, query_batch, radius)
-    assert torch.equal(edges, brute_force(points, point_batch, query, query_batch, radius))
+    index = BACKENDS[name].build(points, point_batch)
+    assert torch.equal(index(query, query_batch, radius), brute_force(points, point_batch, query, query_batch, radius))
+    itself = points, point_batch
+    assert torch.equal(index(*itself, radius), brute_force(*itself, *itself, radius))
 
 
 @every_backend
@@ -179,6 +181,11 @@ def test_the_check_for_captures_sees_what_it_should():
     for bad in (lambda: values[values > 1], lambda: values.unique(), lambda: int(values[0]), lambda: torch.tensor(1)):
         with Capturable(), pytest.raises(AssertionError, match="captured"):
             bad()
+
+
+def test_auto_follows_what_was_measured():
+    assert backend("auto", CPU).name == "kdtree"
+    assert backend("auto", torch.device("cuda")).name == "grid"
 
 
 def test_unknown_backend_is_refused_with_the_known_ones():
