@@ -4,6 +4,7 @@ import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 
+from gns_pyg.graph.features import dot
 from gns_pyg.state import Graph, State
 
 MARGIN_RADII = 0.1  # gaps this small count as touching: paths bend within a frame, and walls between their points
@@ -24,17 +25,18 @@ def can_touch(state: State, free_pos: Float[Tensor, "n_grains 3"], graph: Graph,
     """
     n, way = len(state.pos), free_pos - state.pos
     sender, receiver = graph.grain_edges
-    rel_pos, rel_way = state.pos[sender] - state.pos[receiver], way[sender] - way[receiver]
-    distance = torch.linalg.vector_norm(rel_pos, dim=1)
+    where = torch.cat([state.pos, way], dim=1)
+    rel_pos, rel_way = (where.index_select(0, sender) - where.index_select(0, receiver)).split(3, dim=1)
+    distance = dot(rel_pos, rel_pos).sqrt()
     reach = state.radius[sender] + state.radius[receiver]
-    closing = -(rel_way * rel_pos).sum(1) / distance.clamp(min=1e-9)
+    closing = -dot(rel_way, rel_pos) / distance.clamp(min=1e-9)
     near = distance - reach <= closing.clamp(min=0) + MARGIN_RADII * reach / 2
     touches = torch.zeros(n, device=near.device).index_add(0, receiver, (near & (sender != receiver)).float())
     if graph.walls is not None:
         point, grain = graph.wall_edges
         normal, radius = graph.walls.normal[point], state.radius[grain]
-        height = ((state.pos[grain] - graph.walls.pos[point]) * normal).sum(1)
-        closing = ((graph.walls.vel[point] * dt_s - way[grain]) * normal).sum(1)
+        height = dot(state.pos[grain] - graph.walls.pos[point], normal)
+        closing = dot(graph.walls.vel[point] * dt_s - way[grain], normal)
         near = height - radius <= closing.clamp(min=0) + MARGIN_RADII * radius
         touches = touches.index_add(0, grain, near.float())
     return touches > 0

@@ -118,13 +118,14 @@ class Simulator(nn.Module):
             velocity_m_s=self.statistics.velocity_m_s,
             dt_s=self.scene.frame_dt_s,
             contact=self.config.contact_features,
+            dtype=self.scale.dtype,
         )
-        edges = features.grain_edges(state, graph, **options).to(self.scale.dtype)
+        edges = features.grain_edges(state, graph, **options)
         where, cast = self.scale.device.type, self.execution.autocast
         with torch.autocast(where, cast) if cast else nullcontext():
             total = self.grain_network(None, grains, edges, graph.grain_edges).to(self.scale.dtype)
             if self.wall_network is not None and graph.walls is not None:
-                edges = features.wall_edges(state, graph, graph.walls, **options).to(self.scale.dtype)
+                edges = features.wall_edges(state, graph, graph.walls, **options)
                 points = self._wall_features(graph.walls)
                 total = total + self.wall_network(points, grains, edges, graph.wall_edges).to(self.scale.dtype)
         return total

@@ -1,6 +1,6 @@
 """Edge features, dimensionless: lengths over the grain radius (the mean of two), velocities over the data's scale.
 
-Differences are taken in float64 by the caller's positions; callers cast the result to the model's dtype.
+Differences are taken in the state's float64, then cast to the networks' dtype.
 Edge features follow Mayr et al. 2023 (the paper's [17]): relative position, distance, direction and inverse powers of
 the distance; `contact` adds what a contact law would ask for: gap, approach, slip with spin, and the gap to come.
 """
@@ -16,21 +16,22 @@ N_CONTACT = 10
 
 
 def grain_edges(
-    state: State, graph: Graph, *, velocity_m_s: float, dt_s: float, contact: bool
+    state: State, graph: Graph, *, velocity_m_s: float, dt_s: float, contact: bool, dtype: torch.dtype
 ) -> Float[Tensor, "n_grain_edges f"]:
     """Features of grain-grain edges; `rel_pos` points from receiver to sender."""
     sender, receiver = graph.grain_edges
-    rel_pos = state.pos[sender] - state.pos[receiver]
-    touch = state.radius[sender] + state.radius[receiver]
+    rel_pos = _between(state.pos, sender, receiver, dtype)
+    own = state.radius.to(dtype)
+    touch = own[sender] + own[receiver]
     radius = touch / 2
     distance, direction = _polar(rel_pos, radius)
     features = _geometry(rel_pos, distance, direction, radius)
     if contact:
-        rel_vel = state.vel[sender] - state.vel[receiver]
+        rel_vel = _between(state.vel, sender, receiver, dtype)
         slip = rel_vel
         if state.ang_vel is not None:  # surface velocities at the contact: v + w x arm, arms of opposite sign
-            arm = state.radius[:, None] * state.ang_vel
-            turning = arm[sender] + arm[receiver]
+            arm = (state.radius[:, None] * state.ang_vel).to(dtype)
+            turning = arm.index_select(0, sender) + arm.index_select(0, receiver)
             slip = rel_vel - torch.linalg.cross(turning, direction)
         ahead = torch.linalg.vector_norm(rel_pos + rel_vel * dt_s, dim=1)
         features += _contact(distance - touch, ahead - touch, rel_vel, slip, direction, radius, velocity_m_s, dt_s)
@@ -38,22 +39,35 @@ def grain_edges(
 
 
 def wall_edges(
-    state: State, graph: Graph, walls: Walls, *, velocity_m_s: float, dt_s: float, contact: bool
+    state: State, graph: Graph, walls: Walls, *, velocity_m_s: float, dt_s: float, contact: bool, dtype: torch.dtype
 ) -> Float[Tensor, "n_wall_edges f"]:
     """Features of edges from boundary points to grains; the gap is that to the point's tangent plane."""
     point, grain = graph.wall_edges
-    rel_pos, radius, normal = walls.pos[point] - state.pos[grain], state.radius[grain], walls.normal[point]
+    rel_pos = (walls.pos.index_select(0, point) - state.pos.index_select(0, grain)).to(dtype)
+    radius, normal = state.radius[grain].to(dtype), walls.normal.to(dtype).index_select(0, point)
     distance, direction = _polar(rel_pos, radius)
-    height = -(rel_pos * normal).sum(1)
+    height = -dot(rel_pos, normal)
     features = [*_geometry(rel_pos, distance, direction, radius), (height / radius)[:, None]]
     if contact:
-        rel_vel = walls.vel[point] - state.vel[grain]
+        rel_vel = (walls.vel.index_select(0, point) - state.vel.index_select(0, grain)).to(dtype)
         slip = rel_vel
         if state.ang_vel is not None:
-            slip = rel_vel + torch.linalg.cross(radius[:, None] * state.ang_vel[grain], normal)
-        ahead = height - (rel_vel * normal).sum(1) * dt_s
+            arm = (state.radius[:, None] * state.ang_vel).to(dtype)
+            slip = rel_vel + torch.linalg.cross(arm.index_select(0, grain), normal)
+        ahead = height - dot(rel_vel, normal) * dt_s
         features += _contact(height - radius, ahead - radius, rel_vel, slip, -normal, radius, velocity_m_s, dt_s)
     return torch.cat(features, dim=1)
+
+
+def dot(a: Float[Tensor, "n 3"], b: Float[Tensor, "n 3"]) -> Float[Tensor, " n"]:
+    """Scalar products, row by row; several times as fast as a sum over so short an axis."""
+    x, y, z = (a * b).unbind(1)
+    return x + y + z
+
+
+def _between(values: Tensor, sender: Tensor, receiver: Tensor, dtype: torch.dtype) -> Tensor:
+    """Differences, taken before the cast."""
+    return (values.index_select(0, sender) - values.index_select(0, receiver)).to(dtype)
 
 
 def n_grain_edge_features(contact: bool) -> int:
@@ -86,7 +100,7 @@ def _contact(
     velocity_m_s: float,
     dt_s: float,
 ) -> list[Tensor]:
-    approach = (rel_vel * direction).sum(1, keepdim=True)
-    tangential = slip - (slip * direction).sum(1, keepdim=True) * direction
+    approach = dot(rel_vel, direction)[:, None]
+    tangential = slip - dot(slip, direction)[:, None] * direction
     gaps = torch.stack([gap / radius, (gap / radius).clamp(max=0), gap_ahead / radius], dim=1)
     return [gaps, approach / velocity_m_s, rel_vel / velocity_m_s, tangential / velocity_m_s]

@@ -36,7 +36,7 @@ class ContactNetwork(nn.Module):
         sparse: bool = True,
     ) -> None:
         super().__init__()
-        self.n_out, self.sparse = n_out, sparse
+        self.n_out, self.hidden, self.sparse = n_out, hidden, sparse
 
         def encoder(n_in: int) -> nn.Module:
             return mlp(n_in, hidden, hidden, mlp_layers, layer_norm=skip)
@@ -76,10 +76,8 @@ class ContactNetwork(nn.Module):
                 points, sender = _compact(sending, sender)
                 sender_features = sender_features[points]
             senders = self.encode_sender(sender_features)
-        edges, ends = (
-            [self.encode_edge(block) for block in blocks(edge_features)],
-            blocks(torch.stack([sender, receiver]), 1),
-        )
+        edges = [self.encode_edge(block) for block in blocks(edge_features, self.hidden)]
+        ends = blocks(torch.stack([sender, receiver]), self.hidden, dim=1)
         for interaction in self.interactions:
             receivers, edges = interaction(receivers if senders is None else senders, receivers, edges, ends)
         effect = self.decode(receivers)

@@ -4,7 +4,7 @@ import itertools
 
 from torch import Tensor, nn
 
-BLOCK = 1024  # rows that a CPU handles at once: few enough to stay in its cache through all layers
+BLOCK = 2**17  # numbers of a latent that a CPU handles at once: few enough to stay in its cache through all layers
 
 
 def mlp(n_in: int, hidden: int, n_out: int, layers: int, *, layer_norm: bool = False) -> nn.Sequential:
@@ -20,6 +20,6 @@ def mlp(n_in: int, hidden: int, n_out: int, layers: int, *, layer_norm: bool = F
     return nn.Sequential(*modules, *([nn.LayerNorm(n_out)] if layer_norm else []))
 
 
-def blocks(rows: Tensor, dim: int = 0) -> tuple[Tensor, ...]:
-    """`rows` in pieces that are best handled one after the other; a GPU takes all at once."""
-    return rows.split(BLOCK, dim) if rows.device.type == "cpu" else (rows,)
+def blocks(rows: Tensor, width: int, dim: int = 0) -> tuple[Tensor, ...]:
+    """`rows` in pieces that are best handled one after the other at this width; a GPU takes all at once."""
+    return rows.split(max(1, BLOCK // width), dim) if rows.device.type == "cpu" else (rows,)

@@ -83,7 +83,7 @@ def test_edges_in_blocks_are_the_plain_network_with_the_same_gradients(skip, n_s
         return [effect.detach(), *torch.autograd.grad(effect.square().sum(), used)]
 
     plain = results()
-    monkeypatch.setattr("gns_pyg.models.mlp.BLOCK", 16)
+    monkeypatch.setattr("gns_pyg.models.mlp.BLOCK", 16 * WIDTH)
     for expected, found in zip(plain, results(), strict=True):
         assert torch.allclose(found, expected, rtol=1e-5, atol=1e-5 * float(expected.abs().max()))
 
