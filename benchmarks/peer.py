@@ -38,7 +38,7 @@ def main(system: str, source: str, folder: str) -> None:
     output = running.forward(*running.inputs(graph))
     running.forward_backward(*running.inputs(graph))
     first_s = time.perf_counter() - begin
-    found = {"output": output, **running.weights("weight"), **running.weights("gradient")}
+    found: dict[str, np.ndarray] = {"output": output, **running.weights("weight"), **running.weights("gradient")}
     np.savez(Path(folder) / f"{system}.npz", **found)
     print(json.dumps({"version": running.version, "first_s": first_s}), file=answers)
     random = np.random.default_rng(0)
