@@ -7,7 +7,7 @@ from jaxtyping import Float, Int
 from torch import Tensor, nn
 from torch_geometric.nn import MessagePassing
 
-from gns_pyg.models.mlp import mlp
+from gns_pyg.models.mlp import linear, mlp
 
 
 class Interaction(MessagePassing):
@@ -48,16 +48,16 @@ class Interaction(MessagePassing):
         edge_index: Sequence[Int[Tensor, "2 _"]],
     ) -> tuple[Float[Tensor, "n_receivers hidden"], list[Float[Tensor, "_ hidden"]]]:
         size = (senders.shape[0], receivers.shape[0])
-        nodes = (self.from_sender(senders), self.from_receiver(receivers))
+        nodes = (linear(self.from_sender, senders), linear(self.from_receiver, receivers))
         if len(edges) == 1:
-            messages = self.edge_updater(edge_index[0], x=nodes, edge=self.from_edge(edges[0]), size=size)
+            messages = self.edge_updater(edge_index[0], x=nodes, edge=linear(self.from_edge, edges[0]), size=size)
             received = self.propagate(edge_index[0], messages=messages, size=size)
             after = [edges[0] + messages if self.skip else messages]
         else:
             received, after = torch.zeros_like(receivers), []
             for edge, (sender, receiver) in zip(edges, edge_index, strict=True):
                 ends = nodes[0].index_select(0, sender), nodes[1].index_select(0, receiver)
-                messages = self.edge_update(*ends, self.from_edge(edge))
+                messages = self.edge_update(*ends, linear(self.from_edge, edge))
                 received.index_add_(0, receiver, messages.to(received.dtype))  # sums stay in full precision
                 after.append(edge + messages if self.skip else messages)
         updated = self.update_mlp(torch.cat([receivers, received], dim=1))

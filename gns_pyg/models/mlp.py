@@ -2,12 +2,28 @@
 
 import itertools
 
+import torch
 from torch import Tensor, nn
 
 BLOCK = 2**17  # numbers of a latent that a CPU handles at once: few enough to stay in its cache through all layers
 
+ONE_DNN = torch.backends.mkldnn.is_available() and hasattr(torch.ops.mkldnn, "_linear_pointwise")
 
-def mlp(n_in: int, hidden: int, n_out: int, layers: int, *, layer_norm: bool = False) -> nn.Sequential:
+
+class Mlp(nn.Sequential):
+    """Linear layers with ReLU between them; without gradients on a CPU, both in one kernel of oneDNN."""
+
+    def forward(self, rows: Tensor) -> Tensor:
+        modules = list(self)
+        for module, following in itertools.zip_longest(modules, modules[1:]):
+            if isinstance(module, nn.Linear):
+                rows = linear(module, rows, relu=isinstance(following, nn.ReLU))
+            elif not isinstance(module, nn.ReLU):
+                rows = module(rows)
+        return rows
+
+
+def mlp(n_in: int, hidden: int, n_out: int, layers: int, *, layer_norm: bool = False) -> Mlp:
     """A perceptron of `layers` linear layers with ReLU between them, (n, n_in) -> (n, n_out).
 
     `layer_norm` normalises the output.
@@ -15,9 +31,19 @@ def mlp(n_in: int, hidden: int, n_out: int, layers: int, *, layer_norm: bool = F
     widths = [n_in, *[hidden] * (layers - 1), n_out]
     modules: list[nn.Module] = []
     for wide, narrow in itertools.pairwise(widths):
-        modules += [nn.Linear(wide, narrow), nn.ReLU(inplace=True)]
+        modules += [nn.Linear(wide, narrow), nn.ReLU()]
     modules.pop()
-    return nn.Sequential(*modules, *([nn.LayerNorm(n_out)] if layer_norm else []))
+    return Mlp(*modules, *([nn.LayerNorm(n_out)] if layer_norm else []))
+
+
+def linear(layer: nn.Linear, rows: Tensor, *, relu: bool = False) -> Tensor:
+    """`layer(rows)`, then ReLU on demand."""
+    plain = torch.is_grad_enabled() or torch.is_autocast_enabled("cpu") or rows.dtype != torch.float32
+    if ONE_DNN and rows.device.type == "cpu" and not plain:  # what torch.compile would call, without compiling
+        attr = "relu" if relu else "none"
+        return torch.ops.mkldnn._linear_pointwise(rows, layer.weight, layer.bias, attr, [], "")
+    rows = layer(rows)
+    return rows.relu_() if relu else rows
 
 
 def blocks(rows: Tensor, width: int, dim: int = 0) -> tuple[Tensor, ...]:
