@@ -1,11 +1,12 @@
-# make demo: the main job on the embedded real data.   make test: the tests.   Both set up .venv first.
+# make demo: the main job on the embedded real data.   make test: the tests.   make bench: the quick benchmarks' ratios.
+# All set up .venv first.
 # A plain Python package index serves torch's CUDA build for Linux (several GB). For the small CPU build:
 #   make demo TORCH_INDEX="--index-url https://download.pytorch.org/whl/cpu"
 PYTHON ?= python3
 TORCH_INDEX ?=
 BIN = .venv/bin
 
-.PHONY: setup demo test
+.PHONY: setup demo test bench
 
 setup: .venv/.setup-done
 
@@ -25,3 +26,6 @@ test: setup
 	$(BIN)/ruff format -q --check .
 	$(BIN)/mypy -p gns_pyg -p data_gen
 	$(BIN)/python -m pytest
+
+bench: setup
+	OMP_NUM_THREADS=1 $(BIN)/python -m benchmarks

@@ -1,15 +1,16 @@
-"""Where a step's time goes: `python -m benchmarks.phases [copies ...]`.
+"""Where a step's time goes: `python -m benchmarks.phases`.
 
 Steps an untrained simulator of the paper's width from a recorded state of the full-size drum (generate its case 0
-first), on one thread, and writes benchmarks/results/phases.json: medians of the milliseconds of every phase. More
-copies of the drum are batched as graphs of their own.
+first), then from 10 and 100 copies of that bed beside each other without walls, on one thread. Writes
+benchmarks/results/phases.json: medians of the milliseconds of every phase.
 """
 
 import json
-import sys
+import math
 import time
 from collections import defaultdict
 from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
 from statistics import median
 from typing import Any
@@ -31,7 +32,7 @@ from gns_pyg.graph import features
 from gns_pyg.models.contact_network import ContactNetwork
 from gns_pyg.scene.requirements import Requires, resolve
 from gns_pyg.scene.scene import Scene
-from gns_pyg.state import Window
+from gns_pyg.state import State
 
 OUT = Path(__file__).parent / "results" / "phases.json"
 PHASES: dict[str, list[tuple[Any, str]]] = {
@@ -52,14 +53,17 @@ ROUNDS, FRAME = 9, 150
 
 def main() -> None:
     torch.set_num_threads(1)
-    rows = [profile(int(copies)) for copies in sys.argv[1:] or (1, 10, 100)]
+    rows = [profile(copies) for copies in (1, 10, 100)]
     OUT.write_text(json.dumps({"machine": machine.processor(), "rows": rows}, indent=1) + "\n")
     print(table(rows))
 
 
 @torch.inference_mode()
 def profile(copies: int) -> dict[str, Any]:
-    simulator, state = paper_wide("drum", FRAME, copies)
+    simulator, state = paper_wide("drum", FRAME)
+    if copies > 1:
+        state = side_by_side(state, copies)
+        simulator.boundary = simulator.wall_network = None
     seconds: dict[str, list[float]] = defaultdict(list)
     walls: list[float] = []
     for _ in range(max(3, ROUNDS // copies) + 1):
@@ -97,20 +101,34 @@ def timed(function: Callable, spent: dict[str, float], phase: str) -> Callable:
     return call
 
 
-def paper_wide(name: str, frame: int, copies: int, **changes: Any) -> tuple[Simulator, Any]:
-    """An untrained simulator of width 128 and a recorded state of a scene, `copies` times."""
+def paper_wide(name: str, frame: int) -> tuple[Simulator, State]:
+    """An untrained simulator of width 128 and a recorded state of a scene."""
     with initialize_config_dir(CONF, version_base="1.3"):
         config = compose("train", [f"scene={name}", "model.hidden=128"])
     scene = Scene.from_config(config.scene)
     case = open_case(find_cases(scene, None)[0], scene)
-    requires = resolve(scene, {}, Requires(**changes))
+    requires = resolve(scene, {}, Requires())
     model = typed(ModelConfig, config.model, "model")
     simulator = run.build(scene, model, requires, Split([case], [], []), seed=0).eval()
-    window = Window.collate([read_window(case, frame, 2)] * copies)
-    return simulator, simulator.integrator.read(window, 1)
+    return simulator, simulator.integrator.read(read_window(case, frame, 2), 1)
 
 
-def n_edges(simulator: Simulator, state: Any) -> int:
+def side_by_side(state: State, copies: int) -> State:
+    """Copies of a bed, next to each other along three axes."""
+    extent = state.pos.amax(0) - state.pos.amin(0) + 2 * state.radius.max()
+    side = math.ceil(copies ** (1 / 3))
+    places = torch.cartesian_prod(*[torch.arange(side)] * 3)[:copies].to(extent) * extent
+    return replace(
+        state,
+        pos=(state.pos + places[:, None]).flatten(0, 1),
+        vel=state.vel.repeat(copies, 1),
+        ang_vel=None if state.ang_vel is None else state.ang_vel.repeat(copies, 1),
+        radius=state.radius.repeat(copies),
+        batch=state.batch.repeat(copies),
+    )
+
+
+def n_edges(simulator: Simulator, state: State) -> int:
     graph = simulator.graph(state)
     return graph.grain_edges.shape[1] + graph.wall_edges.shape[1]
 

@@ -11,17 +11,15 @@ import resource
 import subprocess
 import sys
 import time
-from dataclasses import replace
 from pathlib import Path
 from statistics import median
 from typing import Any
 
 import torch
 
-from benchmarks.phases import paper_wide
+from benchmarks.phases import FRAME, paper_wide, side_by_side
 from gns_pyg import machine
 from gns_pyg.dynamics.execution import Execution
-from gns_pyg.state import State
 
 OUT = Path(__file__).parent / "results" / "scaling.json"
 SIZES = {2_530: 9, 25_300: 5, 253_000: 3, 1_001_880: 2}  # grains: counted steps
@@ -50,7 +48,7 @@ def main() -> None:
 def measured(n_grains: int) -> dict[str, Any]:
     """Median seconds of a step, after one that warms up, and the process's peak memory."""
     torch.set_num_threads(1)
-    simulator, bed = paper_wide("drum", 150, 1)
+    simulator, bed = paper_wide("drum", FRAME)
     simulator.boundary = simulator.wall_network = None
     state = side_by_side(bed, n_grains // len(bed.pos))
     simulator.execution = Execution(tile_grains=TILE)
@@ -67,21 +65,6 @@ def measured(n_grains: int) -> dict[str, Any]:
         "seconds": round(median(seconds[n_grains < TILE :]), 3),
     }
     return row | {"peak_memory_gib": round(peak, 2), "tiles": len(state.pos) > TILE}
-
-
-def side_by_side(state: State, copies: int) -> State:
-    """Copies of a bed, next to each other along three axes."""
-    extent = state.pos.amax(0) - state.pos.amin(0) + 2 * state.radius.max()
-    side = math.ceil(copies ** (1 / 3))
-    places = torch.cartesian_prod(*[torch.arange(side)] * 3)[:copies].to(extent) * extent
-    return replace(
-        state,
-        pos=(state.pos + places[:, None]).flatten(0, 1),
-        vel=state.vel.repeat(copies, 1),
-        ang_vel=None if state.ang_vel is None else state.ang_vel.repeat(copies, 1),
-        radius=state.radius.repeat(copies),
-        batch=state.batch.repeat(copies),
-    )
 
 
 def table(found: dict[str, Any]) -> str:
