@@ -5,7 +5,7 @@ import itertools
 import torch
 from torch import Tensor, nn
 
-BLOCK = 2**17  # numbers of a latent that a CPU handles at once: few enough to stay in its cache through all layers
+BLOCK = 2**18  # numbers of a latent that a CPU handles at once: few enough to stay in its cache through all layers
 
 ONE_DNN = torch.backends.mkldnn.is_available() and hasattr(torch.ops.mkldnn, "_linear_pointwise")
 
