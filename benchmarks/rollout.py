@@ -1,4 +1,4 @@
-"""Full-size roll-outs against Yade on the same two cores: `python -m benchmarks.rollout`.
+r"""Full-size roll-outs against Yade on the same two cores: `python -m benchmarks.rollout`.
 
 Yade runs a case of the paper's hopper and drum with two threads, at the paper's 1e-5 s and at its largest step that
 still gives the same observables (`scene.dem.dt_s=auto`); both files are kept in $GNS_DATA/rollout_benchmark. Then every
@@ -6,6 +6,8 @@ bundle of MODELS rolls the second one out, on two threads, and is judged against
 benchmarks/results/rollout.json. The bundles are trained on the reduced scenes first, for example
 
     python train.py scene=hopper_small model.hidden=128 hydra.run.dir=runs/speed/hopper_128
+    python train.py scene=hopper_small model.hidden=32 model.layers=1 scene.frame_dt_s=0.02 \
+        hydra.run.dir=runs/speed/hopper_fast20
 """
 
 import json
@@ -26,7 +28,13 @@ from gns_pyg.data.trajectory import Trajectory
 OUT = Path(__file__).parent / "results" / "rollout.json"
 DATA = Path(os.environ.get("GNS_DATA", "data")) / "rollout_benchmark"
 STEPS = {"1e-5": "1e-5", "equivalent": "auto"}
-MODELS = {"paper's width": "128", "default": "64", "fast": "fast"}
+MODELS = {  # name: bundle, options
+    "paper's width": ("128", ()),
+    "paper's width, bfloat16": ("128", ("execution.precision=bfloat16",)),
+    "default": ("64", ()),
+    "fast": ("fast", ()),
+    "fast, frames of 20 ms": ("fast20", ("scene.frame_dt_s=0.02",)),
+}
 CASE, THREADS = 40, 2
 
 
@@ -36,7 +44,7 @@ def main() -> None:
     found: dict[str, Any] = {"machine": machine.processor(), "threads": THREADS}
     for scene in ("hopper", "drum"):
         yade = {name: yade_seconds(scene, name, step) for name, step in STEPS.items()}
-        rows = [judged(scene, name, folder, yade) for name, folder in MODELS.items()]
+        rows = [judged(scene, name, yade) for name in MODELS]
         factors = {f"factor_yade_{step}": rows[0][f"factor_yade_{step}"] for step in STEPS}
         found[scene] = factors | {"yade_seconds_per_simulated_second": yade, "models": rows}
         OUT.write_text(json.dumps(found, indent=1) + "\n")
@@ -50,11 +58,12 @@ def yade_seconds(scene: str, name: str, step: str) -> float:
     return case.run["wall_clock_s"] / (case.times_s[-1] - case.times_s[0])
 
 
-def judged(scene: str, name: str, folder: str, yade: dict[str, float]) -> dict[str, Any]:
+def judged(scene: str, name: str, yade: dict[str, float]) -> dict[str, Any]:
     """One bundle on the equivalent run."""
+    folder, options = MODELS[name]
     bundle = Path("runs/speed") / f"{scene}_{folder}"
     places = [f"bundle={bundle}/bundle", f"folder={bundle}/full_size", f"data.dir={DATA}/{scene}_equivalent"]
-    metrics = run.evaluate(config("evaluate", *places, f"scene={scene}"))
+    metrics = run.evaluate(config("evaluate", *places, f"scene={scene}", *options))
     seconds = metrics["speed/seconds_per_simulated_second"]
     row = {"model": name, "seconds_per_simulated_second": seconds}
     row |= {f"factor_yade_{step}": round(of_yade / seconds, 2) for step, of_yade in yade.items()}

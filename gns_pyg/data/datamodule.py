@@ -86,10 +86,16 @@ def find_cases(scene: Scene, folder: str | None) -> list[Path]:
 def open_case(path: str | Path, scene: Scene) -> Trajectory:
     """Opens a case and checks it.
 
+    Where the scene's frame is a whole number of the recorded ones, that many are one step of the network. (Not with an
+    inlet: when grains enter depends on the frame.)
+
     Raises:
         DataError: if it is damaged, of another scene, or starts with a grain outside the boundary.
     """
     trajectory = Trajectory(path)
+    every = scene.frame_dt_s / max(trajectory.frame_dt_s, 1e-12)
+    if scene.inlet is None and 1.5 < every < trajectory.n_frames and abs(every - round(every)) < 1e-6:
+        trajectory = Trajectory(path, round(every))
     check_same_scene(trajectory, scene)
     check_inside(trajectory, scene)
     return trajectory

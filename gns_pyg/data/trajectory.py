@@ -21,6 +21,7 @@ class Trajectory:
 
     Args:
         path: an H5MD file written by `TrajectoryWriter`.
+        every: reads only every so many frames, the first among them, as if no other were stored.
 
     Attributes:
         n_frames, n_grains: size.
@@ -34,8 +35,8 @@ class Trajectory:
         DataError: if the file is missing, is not HDF5, is truncated, or breaks the layout (all violations at once).
     """
 
-    def __init__(self, path: str | Path) -> None:
-        self.path = Path(path)
+    def __init__(self, path: str | Path, every: int = 1) -> None:
+        self.path, self.every = Path(path), every
         if not self.path.is_file():
             raise DataError(
                 self.path, "no such file", "a trajectory file (.h5)", "generate it: python -m data_gen.generate"
@@ -58,13 +59,16 @@ class Trajectory:
 
     def _read_fixed(self, file: h5py.File) -> None:
         grains = file[GRAINS]
-        self.n_frames, self.n_grains = grains["position/value"].shape[:2]
+        self._stored, self.n_grains = grains["position/value"].shape[:2]
         self.has_active = "active" in grains
-        self.times_s = grains["position/time"][:].astype(np.float64)
+        self.times_s = grains["position/time"][:: self.every].astype(np.float64)
+        self.n_frames = len(self.times_s)
         self.radius = grains["radius"][:].astype(np.float64)
         self.mass = grains["mass"][:].astype(np.float64)
         attributes = dict(file["parameters"].attrs)
         self.scene: dict[str, Any] = json.loads(attributes.pop("scene"))
+        if self.every > 1:
+            self.scene["frame_dt_s"] *= self.every
         self.run = {key: value.item() if hasattr(value, "item") else value for key, value in attributes.items()}
 
     def read(self, field: str, start: int = 0, stop: int | None = None) -> np.ndarray:
@@ -73,7 +77,7 @@ class Trajectory:
             self._file = h5py.File(self.path, "r")
         if field not in self._file[GRAINS]:
             raise DataError(self.path, f"no {field}", f"the field {field}", "use a DEM run, which stores all fields")
-        return self._file[GRAINS][field]["value"][start:stop].astype(np.float64)
+        return self._file[GRAINS][field]["value"][self._frames(start, stop)].astype(np.float64)
 
     def active(self, start: int = 0, stop: int | None = None) -> np.ndarray:
         """Whether each grain is in the scene in frames [start, stop), bool (n, n_grains)."""
@@ -81,7 +85,11 @@ class Trajectory:
             return np.ones((len(range(self.n_frames)[start:stop]), self.n_grains), bool)
         if self._file is None:
             self._file = h5py.File(self.path, "r")
-        return self._file[GRAINS]["active/value"][start:stop].astype(bool)
+        return self._file[GRAINS]["active/value"][self._frames(start, stop)].astype(bool)
+
+    def _frames(self, start: int, stop: int | None) -> slice:
+        chosen = range(self._stored)[:: self.every][start:stop]
+        return slice(chosen.start, chosen.stop, chosen.step)
 
     @property
     def boundary(self) -> dict[str, dict[str, Any]]:
@@ -102,8 +110,10 @@ class Trajectory:
         return float((self.times_s[-1] - self.times_s[0]) / max(self.n_frames - 1, 1))
 
     def content_hash(self) -> str:
-        """A hash of the positions: the same run has the same hash whatever its file is called."""
-        return hashlib.sha256(np.ascontiguousarray(self.read("position")).tobytes()).hexdigest()[:16]
+        """A hash of all stored positions: the same run has the same hash whatever its file is called, however many of
+        its frames are read."""
+        whole = self if self.every == 1 else Trajectory(self.path)
+        return hashlib.sha256(np.ascontiguousarray(whole.read("position")).tobytes()).hexdigest()[:16]
 
     def __getstate__(self) -> dict[str, Any]:
         return {**self.__dict__, "_file": None}

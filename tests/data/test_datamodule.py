@@ -49,6 +49,15 @@ def test_a_case_of_another_scene_is_refused_with_the_difference(folder):
         split(other, DataConfig(dir=str(folder)))
 
 
+def test_a_frame_may_be_a_whole_number_of_recorded_ones(folder):
+    longer = Scene.from_config(asdict(SCENE) | {"frame_dt_s": 0.02})
+    case = split(longer, DataConfig(dir=str(folder))).train[0]
+    assert case.times_s == pytest.approx([0.0, 0.02, 0.04, 0.06])
+    odd = Scene.from_config(asdict(SCENE) | {"frame_dt_s": 0.015})
+    with pytest.raises(DataError, match="frame_dt_s = 0.01 "):
+        split(odd, DataConfig(dir=str(folder)))
+
+
 @pytest.mark.parametrize(("key", "value"), [("val_cases", -1), ("workers", -1), ("test_fraction", 1.0)])
 def test_a_data_key_out_of_range_is_named(key, value):
     with pytest.raises(ConfigError, match=f"data.{key}"):

@@ -25,7 +25,7 @@ def fields(n_frames: int, n_grains: int, seed: int = 0) -> dict[str, np.ndarray]
 
 def write(path: Path, values: dict[str, np.ndarray]) -> Path:
     n_frames, n_grains = values["position"].shape[:2]
-    scene = {"name": "test", "grains": {"count": n_grains}}
+    scene = {"name": "test", "frame_dt_s": 0.01, "grains": {"count": n_grains}}
     with TrajectoryWriter(path, scene, np.full(n_grains, 0.01), np.full(n_grains, 0.004), BOUNDARY, DECIMALS) as writer:
         for k in range(n_frames):
             writer.append(100 * k, 0.01 * k, *(values[name][k] for name in UNITS))
@@ -252,3 +252,13 @@ def test_the_final_name_appears_only_when_the_run_is_complete(tmp_path) -> None:
         writer.finish(RUN)
         assert leftovers(tmp_path) == ["case.h5"]
     assert leftovers(tmp_path) == ["case.h5"]
+
+
+def test_every_third_frame_is_as_if_no_other_were_stored(good) -> None:
+    stored, thin = Trajectory(good), Trajectory(good, every=3)
+    assert thin.n_frames == 7
+    assert thin.frame_dt_s == pytest.approx(0.03)
+    assert thin.content_hash() == stored.content_hash()
+    for start, stop in ((0, None), (2, 5), (5, 100), (3, 3), (-2, None)):
+        assert (thin.read("velocity", start, stop) == stored.read("velocity")[::3][start:stop]).all()
+        assert len(thin.active(start, stop)) == len(thin.read("velocity", start, stop))

@@ -3,8 +3,9 @@
 import pytest
 import torch
 
-from gns_pyg.models.contact_network import ContactNetwork
+from gns_pyg.models.contact_network import EDGES, NODES, ContactNetwork
 from gns_pyg.models.interaction import Interaction
+from gns_pyg.models.mlp import linear
 
 WIDTH = 8
 
@@ -86,6 +87,28 @@ def test_edges_in_blocks_are_the_plain_network_with_the_same_gradients(skip, n_s
     monkeypatch.setattr("gns_pyg.models.mlp.BLOCK", 16 * WIDTH)
     for expected, found in zip(plain, results(), strict=True):
         assert torch.allclose(found, expected, rtol=1e-5, atol=1e-5 * float(expected.abs().max()))
+
+
+@pytest.mark.parametrize("n_sender", [None, 4])
+def test_without_gradients_layers_see_the_same_numbers_of_rows_at_every_step(n_sender, monkeypatch):
+    model, seen, random = network(n_sender=n_sender), set(), torch.Generator().manual_seed(1)
+
+    def spied(layer, rows, **options):
+        seen.add(len(rows))
+        return linear(layer, rows, **options)
+
+    for n in (20, 31, 57, 256):
+        senders = None if n_sender is None else torch.randn(n, 4, generator=random)
+        grains, edges = torch.randn(n, 3, generator=random), torch.randn(6 * n, 2, generator=random)
+        pairs = torch.randint(0, n, (2, 3 * n), generator=random)
+        edge_index = torch.cat([pairs, pairs.flip(0)], dim=1)
+        expected = model(senders, grains, edges, edge_index).detach()
+        with monkeypatch.context() as patch, torch.inference_mode():
+            for module in ("mlp", "interaction"):
+                patch.setattr(f"gns_pyg.models.{module}.linear", spied)
+            found = model(senders, grains, edges, edge_index)
+        assert torch.allclose(found, expected, rtol=1e-5, atol=1e-5 * float(expected.abs().max()))
+    assert seen <= {NODES, 2 * NODES, EDGES, 2 * EDGES}
 
 
 @pytest.mark.parametrize("n_sender", [None, 4])
