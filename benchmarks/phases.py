@@ -1,8 +1,8 @@
 """Where a step's time goes: `python -m benchmarks.phases`.
 
-Steps an untrained simulator of the paper's width from a recorded state of the full-size drum (generate its case 0
-first), then from 10 and 100 copies of that bed beside each other without walls, on one thread. Writes
-benchmarks/results/phases.json: medians of the milliseconds of every phase.
+Steps an untrained simulator of the paper's width from recorded states of the full-size drum (generate its case 0
+first), another one in every round, then from 10 and 100 copies of those beds beside each other without walls, on one
+thread. Writes benchmarks/results/phases.json: medians of the milliseconds of every phase.
 """
 
 import json
@@ -60,13 +60,14 @@ def main() -> None:
 
 @torch.inference_mode()
 def profile(copies: int) -> dict[str, Any]:
-    simulator, state = paper_wide("drum", FRAME)
+    rounds = max(3, ROUNDS // copies) + 1
+    simulator, *states = paper_wide("drum", *range(FRAME, FRAME + rounds))
     if copies > 1:
-        state = side_by_side(state, copies)
+        states = [side_by_side(state, copies) for state in states]
         simulator.boundary = simulator.wall_network = None
     seconds: dict[str, list[float]] = defaultdict(list)
     walls: list[float] = []
-    for _ in range(max(3, ROUNDS // copies) + 1):
+    for state in states:
         spent: dict[str, float] = defaultdict(float)
         patches = [
             patch.object(owner, name, timed(getattr(owner, name), spent, phase)) for phase, owner, name in hooks()
@@ -101,8 +102,8 @@ def timed(function: Callable, spent: dict[str, float], phase: str) -> Callable:
     return call
 
 
-def paper_wide(name: str, frame: int) -> tuple[Simulator, State]:
-    """An untrained simulator of width 128 and a recorded state of a scene."""
+def paper_wide(name: str, *frames: int) -> tuple[Any, ...]:
+    """An untrained simulator of width 128 and recorded states of a scene."""
     with initialize_config_dir(CONF, version_base="1.3"):
         config = compose("train", [f"scene={name}", "model.hidden=128"])
     scene = Scene.from_config(config.scene)
@@ -110,7 +111,7 @@ def paper_wide(name: str, frame: int) -> tuple[Simulator, State]:
     requires = resolve(scene, {}, Requires())
     model = typed(ModelConfig, config.model, "model")
     simulator = run.build(scene, model, requires, Split([case], [], []), seed=0).eval()
-    return simulator, simulator.integrator.read(read_window(case, frame, 2), 1)
+    return simulator, *(simulator.integrator.read(read_window(case, frame, 2), 1) for frame in frames)
 
 
 def side_by_side(state: State, copies: int) -> State:

@@ -41,9 +41,9 @@ def main() -> None:
 @torch.inference_mode()
 def timed() -> dict[str, float]:
     """Median milliseconds of a step."""
-    simulator, state = paper_wide("drum", FRAME)
+    simulator, *states = paper_wide("drum", *range(FRAME, FRAME + ROUNDS + 1))
     ms: dict[str, list[float]] = {precision: [] for precision in PRECISIONS}
-    for _ in range(ROUNDS + 1):
+    for state in states:
         for precision in PRECISIONS:
             simulator.execution = Execution(precision)
             begin = time.perf_counter()

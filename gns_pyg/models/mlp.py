@@ -38,10 +38,14 @@ def mlp(n_in: int, hidden: int, n_out: int, layers: int, *, layer_norm: bool = F
 
 def linear(layer: nn.Linear, rows: Tensor, *, relu: bool = False) -> Tensor:
     """`layer(rows)`, then ReLU on demand."""
-    plain = torch.is_grad_enabled() or torch.is_autocast_enabled("cpu") or rows.dtype != torch.float32
-    if ONE_DNN and rows.device.type == "cpu" and not plain:  # what torch.compile would call, without compiling
-        attr = "relu" if relu else "none"
-        return torch.ops.mkldnn._linear_pointwise(rows, layer.weight, layer.bias, attr, [], "")
+    if ONE_DNN and rows.device.type == "cpu" and rows.dtype != torch.float64 and not torch.is_grad_enabled():
+        weight: Tensor = layer.weight
+        bias: Tensor | None = layer.bias
+        if torch.is_autocast_enabled("cpu"):
+            cast = torch.get_autocast_dtype("cpu")
+            rows, weight, bias = rows.to(cast), weight.to(cast), None if bias is None else bias.to(cast)
+        # what torch.compile would call, without compiling
+        return torch.ops.mkldnn._linear_pointwise(rows, weight, bias, "relu" if relu else "none", [], "")
     rows = layer(rows)
     return rows.relu_() if relu else rows
 
