@@ -13,14 +13,15 @@ import numpy as np
 from gns_pyg.data.trajectory import Trajectory
 from gns_pyg.errors import DataError, NumericalError
 from gns_pyg.evaluation.baselines import FIRST_FRAME, Climatology, best_trivial, trivial_errors
+from gns_pyg.evaluation.contacts import coordination_number, means, overlap_ratios
 from gns_pyg.evaluation.errors import nanmax, nanmean, position_error, positions
+from gns_pyg.evaluation.flow import discharge_rate, discharged, emptying_time, mixing_index
 from gns_pyg.evaluation.observables import (
     angle_of_repose,
     center_of_mass,
     escaped_grains,
     from_frame,
     granular_temperature,
-    mean_overlap_ratio,
     mean_speed,
     outflow,
     time_mean,
@@ -141,17 +142,28 @@ class Observables:
     Attributes:
         center_of_mass_m: (n_frames, 3), m.
         angle_of_repose_deg: degrees, or None where the scene defines none.
-        overlap_ratio: mean overlap of touching pairs, part of a diameter.
+        overlap_ratios: of every touching pair, part of a diameter, frame by frame.
+        coordination_number: mean number of grains that a grain touches.
         mean_speed_m_s, granular_temperature_m2_s2: (n_frames - 1,), of the step that leaves the frame.
         outflow: part of the grains at the start that have left, or None where the scene has no outlet.
+        discharged: part of the mass that has passed the mouth, or None where the scene has none.
+        mixing_index: Lacey's, or None where the scene is no drum.
     """
 
     center_of_mass_m: np.ndarray
     angle_of_repose_deg: np.ndarray | None
-    overlap_ratio: np.ndarray
+    overlap_ratios: list[np.ndarray]
+    coordination_number: np.ndarray
     mean_speed_m_s: np.ndarray
     granular_temperature_m2_s2: np.ndarray
     outflow: np.ndarray | None
+    discharged: np.ndarray | None
+    mixing_index: np.ndarray | None
+
+    @property
+    def overlap_ratio(self) -> np.ndarray:
+        """Mean overlap of touching pairs, (n_frames,); 0 where none touch."""
+        return means(self.overlap_ratios)
 
 
 @dataclass(frozen=True)
@@ -219,7 +231,12 @@ def evaluate_cases(results: Sequence[CaseResult], climatology: Climatology, scen
       `test/outflow_error_max`, `..._climatology_max`: largest difference from DEM over frames, of the roll-out and of
       the training cases' mean. Absent where the scene has no outlet.
     - `test/escaped_grains`: most at any frame, summed over cases.
-    - `test/mean_overlap_ratio`, `..._dem`: mean over frames after the start, part of a diameter.
+    - `test/mean_overlap_ratio`, `..._dem`: mean over frames after the start, part of a diameter;
+      `test/overlap_ratio_999`: 99.9th percentile over pairs and frames.
+    - `test/mean_speed_m_s`, `test/granular_temperature_m2_s2`, `test/coordination_number`, each with `..._dem`: mean
+      over frames.
+    - `test/discharge_rate_kg_s`, `test/emptying_time_s`, each with `..._dem`: see `flow`; absent without a mouth.
+    - `test/mixing_index_final`, `..._dem`: at the last frame; absent where the scene is no drum.
     - `speed/...`: wall clock per simulated second of roll-out and of Yade, with Yade's cores and time step.
 
     Raises:
@@ -283,10 +300,24 @@ def _evaluate_case(result: CaseResult, trivial_name: str, climatology: Climatolo
             "test/outflow_error_max": nanmax(np.abs(model.outflow - dem.outflow)),
             "test/outflow_error_climatology_max": nanmax(np.abs(expected_outflow - dem.outflow)),
         }
+    for suffix, pos, seen in (("", result.pos, model), ("_dem", result.dem_pos, dem)):
+        every = np.concatenate(seen.overlap_ratios[1:])
+        metrics |= {
+            f"test/mean_overlap_ratio{suffix}": nanmean(seen.overlap_ratio[1:]),
+            f"test/overlap_ratio_999{suffix}": float(np.quantile(every, 0.999)) if len(every) else 0.0,
+            f"test/coordination_number{suffix}": nanmean(seen.coordination_number[1:]),
+            f"test/mean_speed_m_s{suffix}": nanmean(seen.mean_speed_m_s),
+            f"test/granular_temperature_m2_s2{suffix}": nanmean(seen.granular_temperature_m2_s2),
+        }
+        if seen.discharged is not None:
+            metrics |= {
+                f"test/discharge_rate_kg_s{suffix}": discharge_rate(pos, result.mass, result.times_s, scene),
+                f"test/emptying_time_s{suffix}": emptying_time(pos, result.mass, result.times_s, scene),
+            }
+        if seen.mixing_index is not None:
+            metrics[f"test/mixing_index_final{suffix}"] = float(seen.mixing_index[-1])
     metrics |= {
         "test/escaped_grains": int(escaped.max()),
-        "test/mean_overlap_ratio": nanmean(model.overlap_ratio[1:]),
-        "test/mean_overlap_ratio_dem": nanmean(dem.overlap_ratio[1:]),
         "speed/seconds_per_simulated_second": float(result.seconds_per_simulated_second),
         "speed/yade_seconds_per_simulated_second": result.yade_seconds_per_simulated_second,
         "speed/yade_cores": result.yade_cores,
@@ -296,13 +327,17 @@ def _evaluate_case(result: CaseResult, trivial_name: str, climatology: Climatolo
 
 
 def _observe(pos: np.ndarray, result: CaseResult, scene: Scene) -> Observables:
+    drum = scene.angle_of_repose is not None and scene.angle_of_repose.kind == "plane"
     return Observables(
         center_of_mass_m=center_of_mass(pos, result.mass),
         angle_of_repose_deg=None if scene.angle_of_repose is None else angle_of_repose(pos, scene),
-        overlap_ratio=mean_overlap_ratio(pos, result.radius),
+        overlap_ratios=overlap_ratios(pos, result.radius),
+        coordination_number=coordination_number(pos, result.radius),
         mean_speed_m_s=mean_speed(pos, result.times_s),
         granular_temperature_m2_s2=granular_temperature(pos, result.times_s, result.radius),
         outflow=None if scene.outlet is None else outflow(pos),
+        discharged=None if scene.mouth_height_m is None else discharged(pos, result.mass, scene),
+        mixing_index=mixing_index(pos, scene) if drum else None,
     )
 
 

@@ -9,6 +9,7 @@ from scipy.sparse import coo_matrix
 from scipy.sparse.csgraph import connected_components
 from scipy.spatial import cKDTree
 
+from gns_pyg.config import require
 from gns_pyg.errors import ConfigError
 from gns_pyg.evaluation.errors import mean_present, present
 from gns_pyg.scene.containment import outside
@@ -77,20 +78,11 @@ def angle_of_repose(pos: np.ndarray, scene: Scene) -> np.ndarray:
         raise ConfigError(
             "scene.angle_of_repose", "not defined", "a kind (plane or radial) and from_s", "define it in the scene"
         )
-    radius, up = scene.grains.radii_m[-1], up_direction(scene)
-    beds = [_bed(frame[present(frame)], radius) for frame in pos]
     if definition.kind == "plane":
-        axis = np.asarray(definition.axis, np.float64)
-        across = np.cross(up, axis)
-        if not np.linalg.norm(across) > 1e-6 * np.linalg.norm(axis):
-            raise ConfigError(
-                "scene.angle_of_repose.axis", str(definition.axis), "an axis that is not along gravity", "turn the axis"
-            )
-        across, axis = across / np.linalg.norm(across), axis / np.linalg.norm(axis)
-        return np.array([_plane_angle(bed, axis, across, up, radius) for bed in beds])
+        return np.array([np.degrees(np.arctan(abs(surface_slope(frame[present(frame)], scene)))) for frame in pos])
     if definition.kind == "radial":
-        middle = _boundary_middle(scene)
-        return np.array([_radial_angle(bed, middle, up, radius) for bed in beds])
+        radius, middle, up = scene.grains.radii_m[-1], _boundary_middle(scene), up_direction(scene)
+        return np.array([_radial_angle(_bed(frame[present(frame)], radius), middle, up, radius) for frame in pos])
     raise ConfigError("scene.angle_of_repose.kind", definition.kind, "plane or radial", "pick one of them")
 
 
@@ -134,17 +126,30 @@ def time_mean(values: np.ndarray) -> tuple[float, float]:
     return float(values.mean()), float(max(errors, default=float("nan")))
 
 
-def _bed(pos: np.ndarray, radius: float) -> np.ndarray:
-    """Grains (n, 3) of the largest cluster of one frame (n_grains, 3)."""
-    if len(pos) == 0:
-        return pos
-    pairs = cKDTree(pos).query_pairs(BED_GAP_DIAMETERS * 2 * radius, output_type="ndarray")
-    links = coo_matrix((np.ones(len(pairs), np.int8), (pairs[:, 0], pairs[:, 1])), shape=(len(pos), len(pos)))
-    label = connected_components(links, directed=False)[1]
-    return pos[label == np.bincount(label).argmax()]
+def drum_axes(scene: Scene) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Unit vectors of a scene whose angle of repose is `plane`: along the axis, across it, up. Each (3,).
+
+    Raises:
+        ConfigError: for another kind, or an axis along gravity.
+    """
+    definition, up = scene.angle_of_repose, up_direction(scene)
+    plane = definition is not None and definition.kind == "plane"
+    found = "not defined" if definition is None else definition.kind
+    require(plane, "scene.angle_of_repose.kind", found, "plane", "define it in the scene")
+    assert definition is not None
+    axis = np.asarray(definition.axis, np.float64)
+    across = np.cross(up, axis)
+    upright = np.linalg.norm(across) > 1e-6 * np.linalg.norm(axis)
+    expected = "an axis that is not along gravity"
+    require(bool(upright), "scene.angle_of_repose.axis", definition.axis, expected, "turn the axis")
+    return axis / np.linalg.norm(axis), across / np.linalg.norm(across), up
 
 
-def _plane_angle(bed: np.ndarray, axis: np.ndarray, across: np.ndarray, up: np.ndarray, radius: float) -> float:
+def surface_slope(pos: np.ndarray, scene: Scene) -> float:
+    """Slope of a drum's free surface in one frame (n, 3): height over the way across the axis, signed; as
+    `angle_of_repose` reads it. nan where the surface's grains span less than two cells."""
+    (axis, across, up), radius = drum_axes(scene), scene.grains.radii_m[-1]
+    bed = _bed(pos, radius)
     if len(bed) == 0:
         return float("nan")
     along = bed @ axis
@@ -154,7 +159,17 @@ def _plane_angle(bed: np.ndarray, axis: np.ndarray, across: np.ndarray, up: np.n
     middle, half = (coordinate.min() + coordinate.max()) / 2, CENTRAL_SHARE * np.ptp(coordinate) / 2
     central = slab[np.abs(coordinate - middle) <= half]
     tops = central[_surface(central @ across, central @ axis, central @ up, radius)]
-    return float(np.degrees(np.arctan(abs(_slope(tops @ across, tops @ up, radius)))))
+    return _slope(tops @ across, tops @ up, radius)
+
+
+def _bed(pos: np.ndarray, radius: float) -> np.ndarray:
+    """Grains (n, 3) of the largest cluster of one frame (n_grains, 3)."""
+    if len(pos) == 0:
+        return pos
+    pairs = cKDTree(pos).query_pairs(BED_GAP_DIAMETERS * 2 * radius, output_type="ndarray")
+    links = coo_matrix((np.ones(len(pairs), np.int8), (pairs[:, 0], pairs[:, 1])), shape=(len(pos), len(pos)))
+    label = connected_components(links, directed=False)[1]
+    return pos[label == np.bincount(label).argmax()]
 
 
 def _radial_angle(bed: np.ndarray, middle: np.ndarray, up: np.ndarray, radius: float) -> float:
@@ -188,34 +203,6 @@ def _boundary_middle(scene: Scene) -> np.ndarray:
         return np.zeros(3)
     corners = np.concatenate([build_mesh(name, part).bounds for name, part in scene.boundary.items()])
     return 0.5 * (corners.min(axis=0) + corners.max(axis=0))
-
-
-# ------------------------------------------------------------------------------------------ contacts and walls
-
-
-def mean_overlap_ratio(pos: np.ndarray, radius: np.ndarray) -> np.ndarray:
-    """Mean overlap of touching grain pairs as a part of their mean diameter, per frame; walls are not counted.
-
-    A pair touches where d < r_i + r_j; its overlap is (r_i + r_j - d) / (r_i + r_j).
-
-    Args:
-        pos: m, (n_frames, n_grains, 3).
-        radius: m, (n_grains,).
-
-    Returns:
-        (n_frames,), dimensionless (0.01 is one per cent of a diameter); 0 where no pair touches.
-    """
-    ratio = np.zeros(len(pos))
-    for index, frame in enumerate(pos):
-        there = present(frame)
-        at, size = frame[there], radius[there]
-        pairs = cKDTree(at).query_pairs(2 * radius.max(), output_type="ndarray")
-        reach = size[pairs[:, 0]] + size[pairs[:, 1]]
-        overlap = reach - np.linalg.norm(at[pairs[:, 0]] - at[pairs[:, 1]], axis=1)
-        touching = overlap > 0
-        if touching.any():
-            ratio[index] = (overlap[touching] / reach[touching]).mean()
-    return ratio
 
 
 def escaped_grains(pos: np.ndarray, times_s: np.ndarray, scene: Scene) -> np.ndarray:

@@ -5,6 +5,15 @@ from collections.abc import Mapping
 from typing import Any
 
 MISSING = "-"
+OBSERVED = [  # what, key, factor, unit
+    ("overlap, 99.9th percentile", "test/overlap_ratio_999", 100.0, " %"),
+    ("coordination number", "test/coordination_number", 1.0, ""),
+    ("mean speed", "test/mean_speed_m_s", 1.0, " m/s"),
+    ("granular temperature", "test/granular_temperature_m2_s2", 1e4, " cm\N{SUPERSCRIPT TWO}/s\N{SUPERSCRIPT TWO}"),
+    ("discharge rate", "test/discharge_rate_kg_s", 1.0, " kg/s"),
+    ("emptying time", "test/emptying_time_s", 1.0, " s"),
+    ("mixing index, last frame", "test/mixing_index_final", 1.0, ""),
+]
 
 
 def metrics_table(metrics: Mapping[str, Any], title: str, places: Mapping[str, object]) -> str:
@@ -93,6 +102,11 @@ def metric_rows(metrics: Mapping[str, Any]) -> list[tuple[str, str, str]]:
             "overlap, of a diameter",
             percent("test/mean_overlap_ratio"),
             f"{percent('test/mean_overlap_ratio_dem')} DEM",
+        ),
+        *(
+            (what, _number(metrics.get(key), factor, unit), f"{_number(metrics.get(f'{key}_dem'), factor, unit)} DEM")
+            for what, key, factor, unit in OBSERVED
+            if key in metrics
         ),
         ("escaped grains, all cases", _count(metrics.get("test/escaped_grains")), ""),
         (

@@ -319,6 +319,7 @@ class Scene:
     """Everything that defines a granular scene. Lengths in m, times in s, angles in rad.
 
     Attributes:
+        mouth_height_m: height of a hopper's mouth (from the origin, against gravity), for its rate of discharge.
         vary: parameters (of PARAMETERS) that change from case to case -> their values; case n has value n modulo
             their number (see `of_case`).
         state: what a model's state must hold, as `data_gen.restart` measured it (see docs/state.md).
@@ -339,6 +340,7 @@ class Scene:
     angle_of_repose: AngleOfRepose | None = None
     outlet: Outlet | None = None
     inlet: Inlet | None = None
+    mouth_height_m: float | None = None
     vary: dict[str, Any] = field(default_factory=dict)
     state: str = "full"
 

@@ -16,6 +16,7 @@ from gns_pyg.data.trajectory import Trajectory
 from gns_pyg.dynamics.simulator import Simulator
 from gns_pyg.errors import NumericalError
 from gns_pyg.evaluation import observables
+from gns_pyg.evaluation.contacts import mean_overlap_ratio
 from gns_pyg.evaluation.errors import nanmax, nanmean, position_error, positions
 from gns_pyg.evaluation.metrics import write_json
 from gns_pyg.evaluation.predict import one_step_errors, roll_out, start_frame
@@ -127,7 +128,7 @@ def rollout_metrics(
     metrics |= {
         "rollout_error_final_m": float(error[-1]),
         "center_of_mass_error_max_m": nanmax(np.linalg.norm(com - com_dem, axis=1)),
-        "mean_overlap_ratio": float(observables.mean_overlap_ratio(pos, case.radius).mean()),
+        "mean_overlap_ratio": float(mean_overlap_ratio(pos, case.radius).mean()),
         "escaped_grains": float(observables.escaped_grains(pos, times, scene).max()),
     }
     if scene.angle_of_repose is not None:

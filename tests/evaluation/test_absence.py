@@ -5,7 +5,7 @@ import pytest
 
 from gns_pyg.data.trajectory import Trajectory
 from gns_pyg.errors import NumericalError
-from gns_pyg.evaluation import observables
+from gns_pyg.evaluation import contacts, observables
 from gns_pyg.evaluation.baselines import Climatology, climatology, trivial_errors
 from gns_pyg.evaluation.errors import position_error, positions, present
 from gns_pyg.evaluation.metrics import case_result, evaluate_cases
@@ -58,7 +58,7 @@ def test_observables_are_those_of_the_grains_present(tmp_path, kind):
     for ours, theirs in (
         (observables.center_of_mass(more, mass), observables.center_of_mass(pos, case.mass)),
         (observables.angle_of_repose(more, scene), observables.angle_of_repose(pos, scene)),
-        (observables.mean_overlap_ratio(more, radius), observables.mean_overlap_ratio(pos, case.radius)),
+        (contacts.mean_overlap_ratio(more, radius), contacts.mean_overlap_ratio(pos, case.radius)),
         (observables.mean_speed(more, times), observables.mean_speed(pos, times)),
         (
             observables.granular_temperature(more, times, radius),
@@ -79,7 +79,7 @@ def test_a_scene_that_has_run_empty_has_no_means(tmp_path, kind):
     assert np.isnan(observables.mean_speed(pos, times)).all()
     assert np.isnan(observables.granular_temperature(pos, times, ones)).all()
     assert np.isnan(observables.outflow(pos)).all()
-    np.testing.assert_array_equal(observables.mean_overlap_ratio(pos, ones), 0.0)
+    np.testing.assert_array_equal(contacts.mean_overlap_ratio(pos, ones), 0.0)
     np.testing.assert_array_equal(observables.escaped_grains(pos, times, scene), 0)
 
 

@@ -14,7 +14,6 @@ from gns_pyg.evaluation.observables import (
     escaped_grains,
     granular_temperature,
     mean_angle_of_repose,
-    mean_overlap_ratio,
     mean_speed,
     time_mean,
 )
@@ -90,17 +89,6 @@ def test_standard_error_grows_with_correlation():
 def test_time_mean_leaves_missing_frames_out():
     assert time_mean(np.array([1.0, np.nan, 3.0]))[0] == 2.0
     assert np.isnan(time_mean(np.array([np.nan]))).all()
-
-
-def test_overlap_of_two_spheres():
-    radius = np.array([0.01, 0.01, 0.01])
-    pos = np.array([[[0.0, 0, 0], [0.019, 0, 0], [1.0, 0, 0]], [[0.0, 0, 0], [0.021, 0, 0], [1.0, 0, 0]]])
-    np.testing.assert_allclose(mean_overlap_ratio(pos, radius), [0.05, 0.0])
-
-
-def test_overlap_of_unequal_spheres():
-    pos = np.array([[[0.0, 0, 0], [0.027, 0, 0]]])
-    np.testing.assert_allclose(mean_overlap_ratio(pos, np.array([0.01, 0.02])), [0.1])
 
 
 def test_escapes_are_counted_in_the_frame_of_the_turning_box(tmp_path):

@@ -1,0 +1,51 @@
+"""What touching grains say: overlap and coordination number. Grains touch where d < r_i + r_j; walls are not counted.
+
+Positions `pos` are grain centres, m, (n_frames, n_grains, 3) float64, nan where a grain is absent; `radius` is
+(n_grains,), m.
+"""
+
+from collections.abc import Sequence
+
+import numpy as np
+from scipy.spatial import cKDTree
+
+from gns_pyg.evaluation.errors import present
+
+
+def overlap_ratios(pos: np.ndarray, radius: np.ndarray) -> list[np.ndarray]:
+    """Overlap of every touching pair as a part of their mean diameter, (r_i + r_j - d) / (r_i + r_j), frame by frame.
+
+    Returns:
+        n_frames arrays (n_touching,), dimensionless (0.01 is one per cent of a diameter).
+    """
+    return [_overlaps(frame[there], radius[there]) for frame, there in zip(pos, present(pos), strict=True)]
+
+
+def mean_overlap_ratio(pos: np.ndarray, radius: np.ndarray) -> np.ndarray:
+    """Mean of `overlap_ratios`, per frame, (n_frames,); 0 where no pair touches."""
+    return means(overlap_ratios(pos, radius))
+
+
+def means(ratios: Sequence[np.ndarray]) -> np.ndarray:
+    """Mean of every frame's ratios, (n_frames,); 0 where there are none."""
+    return np.array([frame.mean() if len(frame) else 0.0 for frame in ratios])
+
+
+def coordination_number(pos: np.ndarray, radius: np.ndarray) -> np.ndarray:
+    """Mean number of grains that a grain touches, 2 N_contacts / N_grains, per frame, (n_frames,); nan without grains.
+
+    Source: the textbook definition, e.g. Andreotti, Forterre and Pouliquen 2013, Granular Media, section 3.1; grains
+    without contact ("rattlers") count as grains.
+    """
+    contacts = np.array([len(ratios) for ratios in overlap_ratios(pos, radius)])
+    with np.errstate(invalid="ignore"):
+        return 2 * contacts / present(pos).sum(axis=1)
+
+
+def _overlaps(pos: np.ndarray, radius: np.ndarray) -> np.ndarray:
+    if len(pos) == 0:
+        return np.empty(0)
+    first, second = cKDTree(pos).query_pairs(2 * radius.max(), output_type="ndarray").T
+    reach = radius[first] + radius[second]
+    ratio = 1 - np.linalg.norm(pos[first] - pos[second], axis=1) / reach
+    return ratio[ratio > 0]
