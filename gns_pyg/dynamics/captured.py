@@ -11,6 +11,7 @@ import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
+from gns_pyg.config import require
 from gns_pyg.dynamics.free_grains import can_touch
 from gns_pyg.dynamics.simulator import Simulator
 from gns_pyg.graph.neighbors import cells, fixed_pairs
@@ -28,6 +29,8 @@ class Captured:
     """
 
     def __init__(self, simulator: Simulator) -> None:
+        sweeps, expected = simulator.config.projection_sweeps, "a model without projection"
+        require(not sweeps, "execution.capture", f"true, projection_sweeps = {sweeps}", expected, "set it to false")
         self.simulator = simulator
         self.parts = list(simulator.boundary or ())
         self.capacities = [1] * 2 * (1 + len(self.parts))

@@ -21,6 +21,7 @@ class ModelConfig:
         cutoff_grain_radii: two grains see each other within this many times the mean of their radii.
         cutoff_wall_radii: a grain sees boundary points within this many of its radii.
         neighbors: search backend, or `auto`.
+        projection_sweeps: rounds in which every step moves grains out of each other and of walls (see `projection`).
     """
 
     absolute_position: bool = MISSING
@@ -33,11 +34,12 @@ class ModelConfig:
     cutoff_grain_radii: float = MISSING
     cutoff_wall_radii: float = MISSING
     neighbors: str = "auto"
+    projection_sweeps: int = 0
 
     def __post_init__(self) -> None:
         for key in ("cutoff_grain_radii", "cutoff_wall_radii"):
             value = getattr(self, key)
             require(0 < value < math.inf, f"model.{key}", value, "above 0 and finite", "2.5 is the paper's")
-        for key, least in (("hidden", 1), ("layers", 1), ("mlp_layers", 2)):
+        for key, least in (("hidden", 1), ("layers", 1), ("mlp_layers", 2), ("projection_sweeps", 0)):
             value = getattr(self, key)
             require(value >= least, f"model.{key}", value, f"at least {least}", f"set model.{key} to {least} or more")

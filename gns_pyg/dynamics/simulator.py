@@ -15,6 +15,7 @@ from gns_pyg.dynamics.free_grains import among, can_touch
 from gns_pyg.dynamics.integrator import Integrator
 from gns_pyg.dynamics.model_config import ModelConfig
 from gns_pyg.dynamics.passage import Passage
+from gns_pyg.dynamics.projection import separated
 from gns_pyg.dynamics.tiles import tiles
 from gns_pyg.graph import features
 from gns_pyg.graph.neighbors import backend, pairs
@@ -86,7 +87,23 @@ class Simulator(nn.Module):
     def advance(self, state: State, correction: Float[Tensor, "n_grains d"]) -> State:
         """The next state, given what contacts add."""
         after = self.integrator.integrate(state, correction * self.scale)
+        if self.config.projection_sweeps:
+            after = self._separated(state, after)
         return after if self.passage is None else self.passage(state, after)
+
+    def _separated(self, state: State, after: State) -> State:
+        there = after if after.active is None else replace(after.pick(after.active), active=None)
+        search = pairs(backend(self.config.neighbors, there.pos.device).build(there.pos, there.batch))
+        close = search(there.pos, there.batch, 2 * max(self.scene.grains.radii_m))
+        walls, contacts = (None, close[:, :0]) if self.boundary is None else self.boundary.contacts(there)
+        apart = separated(there, close, walls, contacts, self.config.projection_sweeps)
+        if after.active is not None:
+            rows = after.active[:, None]
+            pos, vel = after.pos.masked_scatter(rows, apart.pos), after.vel.masked_scatter(rows, apart.vel)
+            apart = replace(after, pos=pos, vel=vel)
+        if self.requires.state == "differences":
+            apart = replace(apart, vel=(apart.pos - state.pos) / self.scene.frame_dt_s)
+        return apart
 
     def target(self, state: State, following: State) -> Float[Tensor, "n_grains d"]:
         """The value of `correction` that takes `state` to `following`; what training aims at."""
