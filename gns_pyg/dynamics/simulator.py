@@ -93,8 +93,9 @@ class Simulator(nn.Module):
 
     def _separated(self, state: State, after: State) -> State:
         there = after if after.active is None else replace(after.pick(after.active), active=None)
-        search = pairs(backend(self.config.neighbors, there.pos.device).build(there.pos, there.batch))
-        close = search(there.pos, there.batch, 2 * max(self.scene.grains.radii_m))
+        where = there.pos.detach()
+        search = pairs(backend(self.config.neighbors, where.device).build(where, there.batch))
+        close = search(where, there.batch, 2 * max(self.scene.grains.radii_m))
         walls, contacts = (None, close[:, :0]) if self.boundary is None else self.boundary.contacts(there)
         apart = separated(there, close, walls, contacts, self.config.projection_sweeps)
         if after.active is not None:

@@ -7,6 +7,8 @@ import torch
 
 from gns_pyg.dynamics.projection import OVERLAP, separated
 from gns_pyg.state import State, Walls
+from tests import scenes
+from tests.simulators import simulator, state_in_box
 
 R = 0.01
 BOTH_WAYS = torch.tensor([[0, 1], [1, 0]])
@@ -74,3 +76,26 @@ def test_the_nearest_boundary_point_decides():
     contacts = torch.tensor([[0, 1], [0, 0]])
     after = separated(grains((0, 0, 0.006)), NONE, walls, contacts, sweeps=1)
     assert after.pos[0].tolist() == pytest.approx([0.0, 0.0, R])
+
+
+@pytest.mark.parametrize("state", ["full", "differences"])
+def test_a_simulator_with_projection_leaves_less_overlap(state):
+    scene = scenes.scene(120, 2)
+    crowd = state_in_box([120], half_m=0.05, spin=state == "full")
+    with torch.inference_mode():
+        plain, projected = (simulator(scene, state=state, projection_sweeps=sweeps)(crowd) for sweeps in (0, 10))
+
+    def overlap(pos: torch.Tensor) -> float:
+        return float((2 * R - torch.pdist(pos)).clamp(min=0).sum())
+
+    assert overlap(projected.pos) < 0.5 * overlap(plain.pos)
+    if state == "differences":
+        assert torch.allclose(projected.vel, (projected.pos - crowd.pos) / scene.frame_dt_s)
+
+
+def test_grains_that_are_not_there_push_nobody():
+    scene = scenes.scene(2, 2, outlet={"point_m": [0.0, 0.0, -5.0], "normal": [0.0, 0.0, -1.0]})
+    before = replace(grains((0, 0, 0), (0.015, 0, 0)), ang_vel=torch.zeros(2, 3, dtype=torch.float64))
+    alone = replace(before, active=torch.tensor([True, False]))
+    model = simulator(scene, projection_sweeps=5)
+    assert torch.equal(model(alone).pos[0], simulator(scene)(alone).pos[0])
