@@ -5,7 +5,7 @@ are rounded (`scene.dem.decimals`; data_gen/restart.py says what both cost).
 """
 
 import tempfile
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import replace
 from pathlib import Path
 
@@ -91,14 +91,24 @@ def continue_dem(trajectory: Trajectory, scene: Scene, start: Start, n_frames: i
         return positions(Trajectory(path))
 
 
-def layout(heading: Sequence[str], rows: Sequence[tuple[str, Sequence[float]]]) -> str:
-    """A plain-text table of lengths.
+def millimetres(length_m: float) -> str:
+    """A length in mm, four decimals."""
+    return f"{1e3 * length_m:.4f}"
+
+
+def layout(
+    heading: Sequence[str],
+    rows: Sequence[tuple[str, Sequence[float]]],
+    show: Callable[[float], str] = millimetres,
+) -> str:
+    """A plain-text table.
 
     Args:
         heading: of every column, that of the labels first.
-        rows: (label, values in m); shown in mm, four decimals.
+        rows: (label, values).
+        show: a value as text.
     """
-    texts = [list(heading), *([label, *(f"{1e3 * value:.4f}" for value in values)] for label, values in rows)]
+    texts = [list(heading), *([label, *map(show, values)] for label, values in rows)]
     widths = [max(len(text) for text in column) for column in zip(*texts, strict=True)]
     return "\n".join(
         "  ".join([row[0].ljust(widths[0]), *(text.rjust(w) for text, w in zip(row[1:], widths[1:], strict=True))])
