@@ -2,6 +2,8 @@
 
 Positions are corrected, contact by contact, as position-based dynamics does (Mueller et al. 2007, section 3), all
 contacts at once and averaged over those of a grain (Macklin et al. 2014, section 4). Overlap that DEM has too stays.
+A wall is the plane of the nearest boundary point; at an edge that juts into the scene (a hopper's mouth), that is not
+its surface.
 """
 
 from dataclasses import replace
