@@ -1,6 +1,6 @@
 """Training on regions of a scene against training on all of it: `python -m benchmarks.regions [seconds]`.
 
-Trains the default model on the full-size hopper (generate cases 0 to 3 first) for the same processor time, with the
+Trains the default model on the full-size hopper (generate cases 0 to 4 first) for the same processor time, with the
 gradient of all grains and with that of a region of each window, every run in a process of its own, and writes
 benchmarks/results/regions.json: updates, peak memory and error on an unseen case.
 """
