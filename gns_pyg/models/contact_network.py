@@ -7,7 +7,7 @@ from torch import Tensor, nn
 from gns_pyg.models.interaction import Interaction
 from gns_pyg.models.mlp import blocks, mlp
 
-NODES, EDGES = 256, 1024  # oneDNN builds a kernel for every new number of rows, which takes longer than its use
+NODES, EDGES = 128, 512  # oneDNN builds a kernel for every new number of rows, which takes longer than its use
 
 
 class ContactNetwork(nn.Module):
