@@ -18,16 +18,10 @@ from data_gen.continuation import layout
 from gns_pyg.config import CONF, require
 from gns_pyg.data.datamodule import open_cases
 from gns_pyg.data.trajectory import Trajectory
-from gns_pyg.evaluation.contacts import coordination_number, mean_overlap_ratio
-from gns_pyg.evaluation.errors import positions
+from gns_pyg.evaluation.errors import nanmean, positions
 from gns_pyg.evaluation.flow import discharge_rate
-from gns_pyg.evaluation.metrics import write_json
-from gns_pyg.evaluation.observables import (
-    center_of_mass,
-    finite_difference_velocity,
-    granular_temperature,
-    mean_angle_of_repose,
-)
+from gns_pyg.evaluation.metrics import observe, write_json
+from gns_pyg.evaluation.observables import finite_difference_velocity, from_frame, time_mean
 from gns_pyg.evaluation.predict import start_frame
 from gns_pyg.run import entry
 from gns_pyg.scene.scene import Scene
@@ -88,19 +82,20 @@ def observed(case: Trajectory, scene: Scene, start_s: float) -> dict[str, Any]:
     """What a run shows from `start_s` on: numbers, and arrays that are compared by a distance."""
     start = start_frame(case, start_s)
     pos, times_s = positions(case, start), case.times_s[start:]
+    seen = observe(pos, times_s, case.radius, case.mass, scene)
     speed = np.linalg.norm(finite_difference_velocity(pos, times_s), axis=2)
     found: dict[str, Any] = {
-        "center_of_mass_m": center_of_mass(pos, case.mass),
+        "center_of_mass_m": seen.center_of_mass_m,
         "speed_distribution_m_s": speed[np.isfinite(speed)],
-        "mean_speed_m_s": float(np.nanmean(speed)),
-        "granular_temperature_m2_s2": float(np.nanmean(granular_temperature(pos, times_s, case.radius))),
-        "mean_overlap_ratio": float(mean_overlap_ratio(pos, case.radius).mean()),
-        "coordination_number": float(np.nanmean(coordination_number(pos, case.radius))),
+        "mean_speed_m_s": nanmean(seen.mean_speed_m_s),
+        "granular_temperature_m2_s2": nanmean(seen.granular_temperature_m2_s2),
+        "mean_overlap_ratio": nanmean(seen.overlap_ratio),
+        "coordination_number": nanmean(seen.coordination_number),
     }
-    if scene.angle_of_repose is not None:
-        found["angle_of_repose_deg"] = mean_angle_of_repose(pos, times_s, scene)[0]
-    if scene.mouth_height_m is not None:
-        found["discharge_rate_kg_s"] = discharge_rate(pos, case.mass, times_s, scene)
+    if seen.angle_of_repose_deg is not None:
+        found["angle_of_repose_deg"] = time_mean(seen.angle_of_repose_deg[from_frame(times_s, scene) :])[0]
+    if seen.discharged is not None:
+        found["discharge_rate_kg_s"] = discharge_rate(seen.discharged, case.mass, times_s)
     return found
 
 

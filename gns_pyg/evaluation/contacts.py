@@ -31,13 +31,14 @@ def means(ratios: Sequence[np.ndarray]) -> np.ndarray:
     return np.array([frame.mean() if len(frame) else 0.0 for frame in ratios])
 
 
-def coordination_number(pos: np.ndarray, radius: np.ndarray) -> np.ndarray:
+def coordination_number(ratios: Sequence[np.ndarray], pos: np.ndarray) -> np.ndarray:
     """Mean number of grains that a grain touches, 2 N_contacts / N_grains, per frame, (n_frames,); nan without grains.
+    `ratios` are the `overlap_ratios` of `pos`.
 
     Source: the textbook definition, e.g. Andreotti, Forterre and Pouliquen 2013, Granular Media, section 3.1; grains
     without contact ("rattlers") count as grains.
     """
-    contacts = np.array([len(ratios) for ratios in overlap_ratios(pos, radius)])
+    contacts = np.array([len(frame) for frame in ratios])
     with np.errstate(invalid="ignore"):
         return 2 * contacts / present(pos).sum(axis=1)
 

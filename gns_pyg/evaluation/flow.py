@@ -8,7 +8,7 @@ import numpy as np
 
 from gns_pyg.config import require
 from gns_pyg.evaluation.errors import present
-from gns_pyg.evaluation.observables import drum_axes, surface_slope
+from gns_pyg.evaluation.observables import drum_axes, finite_difference_velocity, mid_length, surface_slope
 from gns_pyg.scene.scene import Scene
 from gns_pyg.scene.symmetry import up_direction
 
@@ -34,20 +34,19 @@ def discharged(pos: np.ndarray, mass: np.ndarray, scene: Scene) -> np.ndarray:
     return ((below | left) * mass).sum(axis=1) / mass.sum()
 
 
-def discharge_rate(pos: np.ndarray, mass: np.ndarray, times_s: np.ndarray, scene: Scene) -> float:
-    """Mass flow through the mouth, kg/s: the least-squares slope of the discharged mass while it is between 20 and
-    80 per cent, where the flow of a hopper is steady (Beverloo, Leniger and van de Velde 1961); nan if fewer than
-    three frames are there."""
-    part = discharged(pos, mass, scene)
+def discharge_rate(part: np.ndarray, mass: np.ndarray, times_s: np.ndarray) -> float:
+    """Mass flow through the mouth, kg/s: the least-squares slope of the discharged mass while its `part` (`discharged`)
+    is between 20 and 80 per cent, where the flow of a hopper is steady (Beverloo, Leniger and van de Velde 1961); nan
+    if fewer than three frames are there."""
     bulk = (part >= BULK[0]) & (part <= BULK[1])
     if bulk.sum() < 3:
         return float("nan")
     return float(np.polyfit(times_s[bulk], part[bulk], 1)[0] * mass.sum())
 
 
-def emptying_time(pos: np.ndarray, mass: np.ndarray, times_s: np.ndarray, scene: Scene) -> float:
-    """When 99 per cent of the mass have passed the mouth, s (linear between frames); nan if that does not happen."""
-    part = discharged(pos, mass, scene)
+def emptying_time(part: np.ndarray, times_s: np.ndarray) -> float:
+    """When 99 per cent of the mass have passed the mouth, s (linear between frames); nan if that does not happen.
+    `part` is what has passed, per frame (`discharged`)."""
     late = np.flatnonzero(part >= EMPTIED)
     if len(late) == 0:
         return float("nan")
@@ -71,14 +70,13 @@ def velocity_profile(pos: np.ndarray, times_s: np.ndarray, scene: Scene) -> tupl
     diameter = 2 * scene.grains.radii_m[-1]
     edges = np.arange(LAYER_DIAMETERS + 1) * diameter
     total, count = np.zeros((2, LAYER_DIAMETERS))
-    for frame, velocity in zip(pos[:-1], np.diff(pos, axis=0) / np.diff(times_s)[:, None, None], strict=True):
+    for frame, velocity in zip(pos[:-1], finite_difference_velocity(pos, times_s), strict=True):
         there = present(velocity)
         at, vel, slope = frame[there], velocity[there], surface_slope(frame[there], scene)
         if not np.isfinite(slope):
             continue
-        low, high = np.quantile(at @ axis, [0.25, 0.75])
         lateral = at @ across
-        middle = (at @ axis >= low) & (at @ axis <= high) & (np.abs(lateral - np.median(lateral)) <= 2 * diameter)
+        middle = mid_length(at, axis) & (np.abs(lateral - np.median(lateral)) <= 2 * diameter)
         height = at[middle] @ (up - slope * across) / np.hypot(1, slope)
         down = -np.sign(slope) * (across + slope * up) / np.hypot(1, slope)
         total += np.histogram(height.max() - height, edges, weights=vel[middle] @ down)[0]

@@ -265,7 +265,8 @@ def evaluate_cases(results: Sequence[CaseResult], climatology: Climatology, scen
 def _evaluate_case(result: CaseResult, trivial_name: str, climatology: Climatology, scene: Scene) -> CaseEvaluation:
     error = position_error(result.pos, result.dem_pos)
     frozen = position_error(result.dem_pos[:1], result.dem_pos)
-    dem, model = (_observe(pos, result, scene) for pos in (result.dem_pos, result.pos))
+    run = (result.times_s, result.radius, result.mass, scene)
+    dem, model = (observe(pos, *run) for pos in (result.dem_pos, result.pos))
     expected = climatology.center_of_mass_at(result.times_s)
     escaped = escaped_grains(result.pos, result.times_s, scene)
     after_start = result.one_step_times_s > result.times_s[0] + 1e-9
@@ -300,7 +301,7 @@ def _evaluate_case(result: CaseResult, trivial_name: str, climatology: Climatolo
             "test/outflow_error_max": nanmax(np.abs(model.outflow - dem.outflow)),
             "test/outflow_error_climatology_max": nanmax(np.abs(expected_outflow - dem.outflow)),
         }
-    for suffix, pos, seen in (("", result.pos, model), ("_dem", result.dem_pos, dem)):
+    for suffix, seen in (("", model), ("_dem", dem)):
         every = np.concatenate(seen.overlap_ratios[1:])
         metrics |= {
             f"test/mean_overlap_ratio{suffix}": nanmean(seen.overlap_ratio[1:]),
@@ -311,8 +312,8 @@ def _evaluate_case(result: CaseResult, trivial_name: str, climatology: Climatolo
         }
         if seen.discharged is not None:
             metrics |= {
-                f"test/discharge_rate_kg_s{suffix}": discharge_rate(pos, result.mass, result.times_s, scene),
-                f"test/emptying_time_s{suffix}": emptying_time(pos, result.mass, result.times_s, scene),
+                f"test/discharge_rate_kg_s{suffix}": discharge_rate(seen.discharged, result.mass, result.times_s),
+                f"test/emptying_time_s{suffix}": emptying_time(seen.discharged, result.times_s),
             }
         if seen.mixing_index is not None:
             metrics[f"test/mixing_index_final{suffix}"] = float(seen.mixing_index[-1])
@@ -326,17 +327,19 @@ def _evaluate_case(result: CaseResult, trivial_name: str, climatology: Climatolo
     return CaseEvaluation(result, error, frozen, dem, model, expected, escaped, metrics)
 
 
-def _observe(pos: np.ndarray, result: CaseResult, scene: Scene) -> Observables:
+def observe(pos: np.ndarray, times_s: np.ndarray, radius: np.ndarray, mass: np.ndarray, scene: Scene) -> Observables:
+    """What positions (n_frames, n_grains, 3), m, show, be they DEM's or a roll-out's."""
+    ratios = overlap_ratios(pos, radius)
     drum = scene.angle_of_repose is not None and scene.angle_of_repose.kind == "plane"
     return Observables(
-        center_of_mass_m=center_of_mass(pos, result.mass),
+        center_of_mass_m=center_of_mass(pos, mass),
         angle_of_repose_deg=None if scene.angle_of_repose is None else angle_of_repose(pos, scene),
-        overlap_ratios=overlap_ratios(pos, result.radius),
-        coordination_number=coordination_number(pos, result.radius),
-        mean_speed_m_s=mean_speed(pos, result.times_s),
-        granular_temperature_m2_s2=granular_temperature(pos, result.times_s, result.radius),
+        overlap_ratios=ratios,
+        coordination_number=coordination_number(ratios, pos),
+        mean_speed_m_s=mean_speed(pos, times_s),
+        granular_temperature_m2_s2=granular_temperature(pos, times_s, radius),
         outflow=None if scene.outlet is None else outflow(pos),
-        discharged=None if scene.mouth_height_m is None else discharged(pos, result.mass, scene),
+        discharged=None if scene.mouth_height_m is None else discharged(pos, mass, scene),
         mixing_index=mixing_index(pos, scene) if drum else None,
     )
 

@@ -152,14 +152,19 @@ def surface_slope(pos: np.ndarray, scene: Scene) -> float:
     bed = _bed(pos, radius)
     if len(bed) == 0:
         return float("nan")
-    along = bed @ axis
-    low, high = np.quantile(along, [0.25, 0.75])
-    slab = bed[(along >= low) & (along <= high)]
+    slab = bed[mid_length(bed, axis)]
     coordinate = slab @ across
     middle, half = (coordinate.min() + coordinate.max()) / 2, CENTRAL_SHARE * np.ptp(coordinate) / 2
     central = slab[np.abs(coordinate - middle) <= half]
     tops = central[_surface(central @ across, central @ axis, central @ up, radius)]
     return _slope(tops @ across, tops @ up, radius)
+
+
+def mid_length(pos: np.ndarray, axis: np.ndarray) -> np.ndarray:
+    """Which grains (n, 3) are the middle half along the axis, away from end caps, bool (n,)."""
+    along = pos @ axis
+    low, high = np.quantile(along, [0.25, 0.75])
+    return (along >= low) & (along <= high)
 
 
 def _bed(pos: np.ndarray, radius: float) -> np.ndarray:

@@ -8,6 +8,9 @@ from torch import Tensor, nn
 BLOCK = 2**18  # numbers of a latent that a CPU handles at once: few enough to stay in its cache through all layers
 
 ONE_DNN = torch.backends.mkldnn.is_available() and hasattr(torch.ops.mkldnn, "_linear_pointwise")
+FUSED = {torch.float32} if ONE_DNN else set()  # what oneDNN multiplies here
+if ONE_DNN and torch.ops.mkldnn._is_mkldnn_bf16_supported():
+    FUSED.add(torch.bfloat16)
 
 
 class Mlp(nn.Sequential):
@@ -38,14 +41,13 @@ def mlp(n_in: int, hidden: int, n_out: int, layers: int, *, layer_norm: bool = F
 
 def linear(layer: nn.Linear, rows: Tensor, *, relu: bool = False) -> Tensor:
     """`layer(rows)`, then ReLU on demand."""
-    if ONE_DNN and rows.device.type == "cpu" and rows.dtype != torch.float64 and not torch.is_grad_enabled():
-        weight: Tensor = layer.weight
-        bias: Tensor | None = layer.bias
-        if torch.is_autocast_enabled("cpu"):
-            cast = torch.get_autocast_dtype("cpu")
-            rows, weight, bias = rows.to(cast), weight.to(cast), None if bias is None else bias.to(cast)
+    cast = torch.get_autocast_dtype("cpu") if torch.is_autocast_enabled("cpu") else layer.weight.dtype
+    if rows.device.type == "cpu" and {rows.dtype, cast} <= FUSED and not torch.is_grad_enabled():
+        bias = None if layer.bias is None else layer.bias.to(cast)
         # what torch.compile would call, without compiling
-        return torch.ops.mkldnn._linear_pointwise(rows, weight, bias, "relu" if relu else "none", [], "")
+        return torch.ops.mkldnn._linear_pointwise(
+            rows.to(cast), layer.weight.to(cast), bias, "relu" if relu else "none", [], ""
+        )
     rows = layer(rows)
     return rows.relu_() if relu else rows
 

@@ -27,6 +27,7 @@ def test_grains_of_a_cubic_lattice_have_six_neighbours(spacing):
     """8 corners have 3, 12 edges 4, 6 faces 5 and the middle 6: 108 / 27 in all; none just out of touch."""
     lattice = np.stack(np.meshgrid(*[np.arange(3.0)] * 3), axis=-1).reshape(1, -1, 3) * spacing
     absent = np.full((1, 1, 3), np.nan)
-    found = coordination_number(np.concatenate([lattice, absent], axis=1), np.full(28, 0.01))
+    pos = np.concatenate([lattice, absent], axis=1)
+    found = coordination_number(overlap_ratios(pos, np.full(28, 0.01)), pos)
     np.testing.assert_allclose(found, [4.0 if spacing < 0.02 else 0.0])
-    assert np.isnan(coordination_number(absent, np.full(1, 0.01))).all()
+    assert np.isnan(coordination_number(overlap_ratios(absent, np.full(1, 0.01)), absent)).all()

@@ -22,15 +22,16 @@ def stream(mouth_height_m=0.2):
 
 def test_discharge_of_a_steady_stream():
     pos, scene = stream()
-    assert discharge_rate(pos, MASS, TIMES, scene) == pytest.approx(50.0)
-    assert emptying_time(pos, MASS, TIMES, scene) == pytest.approx(1.09)
-    assert discharged(pos, MASS, scene)[[0, 60, -1]] == pytest.approx([0.0, 0.5, 1.0])
+    part = discharged(pos, MASS, scene)
+    assert discharge_rate(part, MASS, TIMES) == pytest.approx(50.0)
+    assert emptying_time(part, TIMES) == pytest.approx(1.09)
+    assert part[[0, 60, -1]] == pytest.approx([0.0, 0.5, 1.0])
 
 
 def test_a_hopper_that_does_not_empty_has_no_emptying_time_and_a_blocked_one_no_rate():
     pos, scene = stream()
-    assert np.isnan(emptying_time(pos[:100], MASS, TIMES[:100], scene))
-    assert np.isnan(discharge_rate(pos[:5], MASS, TIMES[:5], scene))
+    assert np.isnan(emptying_time(discharged(pos[:100], MASS, scene), TIMES[:100]))
+    assert np.isnan(discharge_rate(discharged(pos[:5], MASS, scene), MASS, TIMES[:5]))
 
 
 def test_discharge_of_a_scene_without_a_mouth_is_refused():
