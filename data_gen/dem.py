@@ -6,7 +6,7 @@ import shutil
 import subprocess
 import tempfile
 from collections import deque
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -26,23 +26,26 @@ Progress = Callable[[int, int, float], None]  # frames done, frames in all, seco
 def run_dem(
     scene: Scene,
     meshes: Mapping[str, Trimesh],
-    start: Start,
+    starts: Start | Sequence[Start],
     path: Path,
     case: int = 0,
     cores: int = 1,
     n_frames: int | None = None,
+    facts: Mapping[str, Any] | None = None,
     progress: Progress | None = None,
 ) -> None:
-    """Runs Yade from `start` and writes the trajectory to `path`.
+    """Runs Yade from `starts` and writes the trajectory to `path`.
 
     Args:
         scene: what is simulated; stored in the file as resolved.
         meshes: mesh of every boundary part in its body frame, m.
-        start: grains and time that the run starts from; any stored frame will do.
+        starts: grains and time that the run starts from; any stored frame will do. Several are run one after the other,
+            their frames stored in a row.
         path: final name of the file; it appears only when the run is complete.
         case: number stored with the run.
         cores: threads of Yade.
         n_frames: frames to store, the start included; the whole scene's when None.
+        facts: stored with the facts of the run.
         progress: called after every stored frame.
 
     Raises:
@@ -66,13 +69,16 @@ def run_dem(
             "case": case,
             "cores": cores,
             "n_frames": n_frames or scene.n_frames,
-            "time_s": start.time_s,
+            "facts": dict(facts or {}),
             "parent": os.getpid(),
         }
         (Path(folder) / "job.json").write_text(json.dumps(job))
         plan = entries(scene)
         arrays: dict[str, Any] = {"entry_time_s": plan.time_s, "entry_pos": plan.pos, "entry_vel": plan.vel}
-        arrays |= {name: getattr(start, name) for name in ("pos", "vel", "ang_vel", "radius", "active")}
+        starts = [starts] if isinstance(starts, Start) else starts
+        for name in ("pos", "vel", "ang_vel", "active", "time_s"):
+            arrays[name] = np.stack([getattr(start, name) for start in starts])
+        arrays["radius"] = starts[0].radius
         for name, mesh in meshes.items():
             arrays[f"vertices/{name}"], arrays[f"triangles/{name}"] = np.array(mesh.vertices), np.array(mesh.faces)
         np.savez(Path(folder) / "arrays.npz", **arrays)

@@ -103,22 +103,17 @@ def add_part(part: dict, triangles: np.ndarray, grain_material: dict, time_s: fl
 class Grains:
     """The grains of a case: those in Yade, those that have left and those that will enter."""
 
-    def __init__(self, scene: dict, arrays: dict) -> None:
+    def __init__(self, scene: dict, arrays: dict, start: int) -> None:
         values = scene["grains"]["material"]
         self.scene, self.material = scene, material(values, values["friction_angle_rad"])
         self.radius = arrays["radius"]
-        self.pos, self.vel, self.ang_vel = (arrays[name].copy() for name in ("pos", "vel", "ang_vel"))
-        self.passing = scene["outlet"] is not None or scene["inlet"] is not None
-        self.active = arrays["active"].astype(bool)
+        self.pos, self.vel, self.ang_vel = (arrays[name][start].copy() for name in ("pos", "vel", "ang_vel"))
+        self.active = arrays["active"][start].astype(bool)
         self.entries = [arrays[f"entry_{name}"] for name in ("time_s", "pos", "vel")]
         self.first_entry = len(self.radius) - len(self.entries[0])
         there = np.flatnonzero(self.active).tolist()
         ids = O.bodies.append([self._sphere(grain) for grain in there])
         self.bodies = {grain: O.bodies[i] for grain, i in zip(there, ids, strict=True)}
-
-    @property
-    def mass(self) -> np.ndarray:
-        return self.material.density * 4 / 3 * np.pi * self.radius**3
 
     def frame(self, time_s: float, dt_s: float) -> None:
         """Reads all grains, then lets those out that are beyond the outlet and those in whose time has come."""
@@ -162,16 +157,75 @@ def steps_per_frame(scene: dict, smallest_radius_m: float) -> int:
 
 def run(folder: Path) -> None:
     job = json.loads((folder / "job.json").read_text())
-    scene, time_s = job["scene"], job["time_s"]
+    scene = job["scene"]
     with np.load(folder / "arrays.npz") as archive:
         arrays = dict(archive)
     shutil.rmtree(folder, ignore_errors=True)  # all is read; nothing is left over if both processes are killed
-    boundary, moving = {}, []
+    boundary = {}
     for name, part in scene["boundary"].items():
         vertices, triangles = arrays[f"vertices/{name}"], arrays[f"triangles/{name}"]
         boundary[name] = {"vertices": vertices, "triangles": triangles, "motion": part["motion"]}
-        moving += add_part(part, vertices[triangles], scene["grains"]["material"], time_s)
-    grains = Grains(scene, arrays)
+    times_s, n_frames, step = arrays["time_s"].tolist(), job["n_frames"], 0
+    mass = scene["grains"]["material"]["density_kg_m3"] * 4 / 3 * np.pi * arrays["radius"] ** 3
+    passing, decimals = scene["outlet"] is not None or scene["inlet"] is not None, scene["dem"]["decimals"]
+    clock = Clock()
+    with TrajectoryWriter(
+        job["path"], scene, arrays["radius"], mass, boundary, decimals, with_active=passing
+    ) as writer:
+        for number, start_s in enumerate(times_s):
+            grains, moving, per_frame = build(scene, arrays, boundary, number)
+            for frame in range(n_frames):
+                now_s = start_s + frame * scene["frame_dt_s"]
+                if frame:
+                    clock.run(per_frame, moving, start_s)
+                    grains.frame(now_s, scene["frame_dt_s"])
+                    step += per_frame
+                writer.append(step, now_s, grains.pos, grains.vel, grains.ang_vel, grains.active)
+                done = number * n_frames + frame + 1
+                print("frame", done, len(times_s) * n_frames, f"{clock.wall_s:.3f}", flush=True)
+                if os.getppid() != job["parent"]:
+                    raise SystemExit("the process that started this run is gone: stopping")
+        writer.finish(
+            {
+                "case": job["case"],
+                "seed": scene["seed"],
+                "wall_clock_s": clock.wall_s,
+                "cpu_time_s": clock.cpu_s,
+                "cores": job["cores"],
+                "steps": step,
+                "dt_s": O.dt,
+                "creator": "Yade",
+                "creator_version": str(yade.config.version),
+                "processor": machine.processor(),
+                **job["facts"],
+            }
+        )
+
+
+class Clock:
+    """Steps Yade and adds up what the stepping takes."""
+
+    def __init__(self) -> None:
+        self.wall_s = self.cpu_s = 0.0
+
+    def run(self, steps: int, moving: list, from_s: float) -> None:
+        wall, cpu = time.perf_counter(), time.process_time()
+        for _ in range(steps):  # O.run(n, wait=True) polls every 40 ms and would spoil the clock
+            for part in moving:
+                part.step(from_s + O.time, O.dt)
+            O.step()
+        self.wall_s += time.perf_counter() - wall
+        self.cpu_s += time.process_time() - cpu
+
+
+def build(scene: dict, arrays: dict, boundary: dict, number: int) -> tuple:
+    """Fills an empty Yade with the start `number`; returns its grains, its moving parts and the steps of a frame."""
+    O.reset()
+    moving = []
+    for name, part in scene["boundary"].items():
+        triangles = boundary[name]["vertices"][boundary[name]["triangles"]]
+        moving += add_part(part, triangles, scene["grains"]["material"], float(arrays["time_s"][number]))
+    grains = Grains(scene, arrays, number)
     per_frame = steps_per_frame(scene, grains.radius.min())
     O.dt = scene["frame_dt_s"] / per_frame
     O.engines = [
@@ -190,41 +244,7 @@ def run(folder: Path) -> None:
             gravity=scene["gravity_m_s2"], damping=scene["damping"], dampGravity=scene["damping_on_gravity"]
         ),
     ]
-    n_frames, decimals = job["n_frames"], scene["dem"]["decimals"]
-    wall_clock_s = cpu_time_s = 0.0
-    with TrajectoryWriter(
-        job["path"], scene, grains.radius, grains.mass, boundary, decimals, with_active=grains.passing
-    ) as writer:
-        for frame in range(n_frames):
-            if frame:
-                wall, cpu = time.perf_counter(), time.process_time()
-                for _ in range(per_frame):  # O.run(n, wait=True) polls every 40 ms and would spoil the clock
-                    for part in moving:
-                        part.step(time_s + O.time, O.dt)
-                    O.step()
-                wall_clock_s += time.perf_counter() - wall
-                cpu_time_s += time.process_time() - cpu
-            now_s = time_s + frame * scene["frame_dt_s"]
-            if frame:
-                grains.frame(now_s, scene["frame_dt_s"])
-            writer.append(frame * per_frame, now_s, grains.pos, grains.vel, grains.ang_vel, grains.active)
-            print("frame", frame + 1, n_frames, f"{wall_clock_s:.3f}", flush=True)
-            if os.getppid() != job["parent"]:
-                raise SystemExit("the process that started this run is gone: stopping")
-        writer.finish(
-            {
-                "case": job["case"],
-                "seed": scene["seed"],
-                "wall_clock_s": wall_clock_s,
-                "cpu_time_s": cpu_time_s,
-                "cores": job["cores"],
-                "steps": (n_frames - 1) * per_frame,
-                "dt_s": O.dt,
-                "creator": "Yade",
-                "creator_version": str(yade.config.version),
-                "processor": machine.processor(),
-            }
-        )
+    return grains, moving, per_frame
 
 
 run(Path(sys.argv[1]))

@@ -58,6 +58,13 @@ def train(cfg: DictConfig) -> dict[str, Any]:
     model = typed(ModelConfig, cfg.model, "model")
     data = typed(DataConfig, cfg.data, "data")
     forced = typed(Requires, cfg.requires, "requires")
+    require(
+        not (data.answers and training.unroll),
+        "training.unroll",
+        f"{training.unroll} with data.answers",
+        "0: answers are single frames, and tell what own steps would",
+        "set training.unroll=0",
+    )
     cases = split(scene, data)
     requires = resolve(scene, values(cases.train), forced)
     log.info("what the scene requires (requires.<row> forces one):\n%s", requires)
@@ -71,9 +78,11 @@ def train(cfg: DictConfig) -> dict[str, Any]:
         workers=data.workers,
     )
     log.info(
-        "%s: %d cases to train on, %d for validation, %d unseen", scene.name, *(len(c) for c in vars(cases).values())
+        "%s: %d cases to train on, %d for validation, %d unseen; %d files of answers",
+        scene.name,
+        *(len(c) for c in vars(cases).values()),
     )
-    simulator = build(scene, model, requires, cases, training.seed)
+    simulator = build(scene, model, requires, cases, training)
     log.info("model: %d parameters", sum(p.numel() for p in simulator.parameters()))
     used = cases.describe()
     identity = flat({"model": asdict(model), "training": asdict(training), "cases": used})
@@ -127,13 +136,41 @@ def warn_outside(scene: Scene, case: Trajectory, start: int, card: dict[str, Any
         log.warning("%s: outside what the bundle was trained on: %s", case.path.name, text)
 
 
-def build(scene: Scene, config: ModelConfig, requires: Requirements, cases: Split, seed: int) -> Simulator:
-    """A new simulator for a scene, its scales measured on the training cases, its weights drawn from `seed`."""
-    statistics = measure(cases.train, Integrator(scene, requires.state, free_flight=requires.free_flight))
+def build(
+    scene: Scene, config: ModelConfig, requires: Requirements, cases: Split, training: TrainingConfig
+) -> Simulator:
+    """A simulator for a scene: its scales measured on the training cases and its weights drawn from the seed, or both
+    taken from the bundle `training.start_from`.
+
+    Raises:
+        BundleError: if that bundle cannot be read.
+        ConfigError: if its model or what it requires differs.
+    """
+    start = None if training.start_from is None else bundle.load(training.start_from)
+    if start is not None:
+        here, there = (
+            flat({"model": asdict(m), "requires": asdict(r)})
+            for m, r in ((config, requires), (start.config, start.requires))
+        )
+        keys = [key for key in sorted({*here, *there}) if here.get(key) != there.get(key) and "reasons" not in key]
+        require(
+            not keys,
+            "training.start_from",
+            "; ".join(f"{key} = {there.get(key)}" for key in keys),
+            "; ".join(f"{key} = {here.get(key)}" for key in keys),
+            "start from a bundle of this model",
+        )
+        statistics = start.statistics
+    else:
+        statistics = measure(cases.train, Integrator(scene, requires.state, free_flight=requires.free_flight))
     points = boundary_points(scene, config.cutoff_wall_radii)
     with torch.random.fork_rng():
-        torch.manual_seed(seed)
-        return Simulator(scene, config, requires, points, statistics)
+        torch.manual_seed(training.seed)
+        simulator = Simulator(scene, config, requires, points, statistics)
+    if start is not None:
+        networks = {key: value for key, value in start.state_dict().items() if not key.startswith("boundary.")}
+        simulator.load_state_dict(networks, strict=False)
+    return simulator
 
 
 def build_trainer(cfg: DictConfig, training: TrainingConfig, where: torch.device) -> pl.Trainer:

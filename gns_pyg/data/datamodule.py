@@ -3,17 +3,17 @@
 import math
 import os
 from collections.abc import Iterable, Sequence
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, field
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytorch_lightning as pl
-from torch.utils.data import DataLoader
+from torch.utils.data import ConcatDataset, DataLoader
 
 from gns_pyg.config import flat, require
 from gns_pyg.data.trajectory import Trajectory
-from gns_pyg.data.windows import UpdateSampler, Windows
+from gns_pyg.data.windows import Answers, UpdateSampler, Windows
 from gns_pyg.errors import ConfigError, DataError
 from gns_pyg.scene.containment import outside
 from gns_pyg.scene.mesh import build_mesh, same_mesh
@@ -32,12 +32,14 @@ class DataConfig:
         test_fraction: share of cases kept for testing, the last ones, rounded up.
         val_cases: cases kept for validation roll-outs during training.
         workers: data-loading processes beside the main one.
+        answers: folders of answers_*.h5 to train on too (see `data_gen.answers`).
     """
 
     dir: str | None = None
     test_fraction: float = 0.2
     val_cases: int = 1
     workers: int = 0
+    answers: list[str] = field(default_factory=list)
 
     def __post_init__(self) -> None:
         require(0 <= self.test_fraction < 1, "data.test_fraction", self.test_fraction, "0 up to below 1", "e.g. 0.2")
@@ -52,13 +54,14 @@ class Split:
     train: list[Trajectory]
     val: list[Trajectory]
     test: list[Trajectory]
+    answers: list[Trajectory] = field(default_factory=list)  # to states of roll-outs of training cases
 
     def describe(self) -> dict[str, dict[str, str]]:
         """File name -> content hash, by purpose: what a bundle remembers of its data."""
         return {
             purpose: {t.path.name: t.content_hash() for t in getattr(self, purpose)}
             for purpose in ("train", "val", "test")
-        }
+        } | {"answers": {f"{t.path.parent.name}/{t.path.name}": t.content_hash() for t in self.answers}}
 
 
 def find_cases(scene: Scene, folder: str | None) -> list[Path]:
@@ -122,15 +125,37 @@ def split(scene: Scene, config: DataConfig) -> Split:
             "at least one left to train on",
             "generate more cases, or lower data.test_fraction or data.val_cases",
         )
+    train = trajectories[:n_train]
     return Split(
-        trajectories[:n_train],
+        train,
         trajectories[n_train : n_train + config.val_cases],
         trajectories[-n_test:] if n_test else [],
+        [file for folder in config.answers for file in open_answers(Path(folder), scene, train)],
     )
 
 
-def check_same_scene(trajectory: Trajectory, scene: Scene) -> None:
-    """Compares what a case says it was made from, and what it holds, with `scene`.
+def open_answers(folder: Path, scene: Scene, train: Sequence[Trajectory]) -> list[Trajectory]:
+    """Opens and checks the answers (see `data_gen.answers`) in a folder.
+
+    Raises:
+        DataError: if there are none, or some are damaged, of another scene, or to roll-outs of no training case.
+    """
+    make = "make them: python -m data_gen.answers bundle=... out=..."
+    if not (paths := sorted(folder.glob("answers_*.h5"))):
+        raise DataError(folder, "no answers_*.h5", "answers of the DEM (data.answers)", make)
+    files, known = [Trajectory(path) for path in paths], {case.content_hash() for case in train}
+    for file in files:
+        check_same_scene(file, scene, regular=False)
+        if file.run.get("rolled_out_from") not in known:
+            raise DataError(
+                file.path, "answers to a roll-out of a case that is not trained on", "training cases only", make
+            )
+    return files
+
+
+def check_same_scene(trajectory: Trajectory, scene: Scene, *, regular: bool = True) -> None:
+    """Compares what a case says it was made from, and what it holds, with `scene`; unless `regular` is false, its
+    frames must be the scene's frame step apart.
 
     Raises:
         DataError: if they differ; names every difference.
@@ -147,6 +172,8 @@ def check_same_scene(trajectory: Trajectory, scene: Scene) -> None:
         for key in sorted(ours | theirs)
         if ours.get(key) != theirs.get(key)
     ] + _held_otherwise(trajectory, scene)
+    if regular:
+        different += _irregular(trajectory, scene)
     if different:
         raise DataError(
             trajectory.path,
@@ -179,12 +206,7 @@ def check_inside(trajectory: Trajectory, scene: Scene) -> None:
 def _held_otherwise(trajectory: Trajectory, scene: Scene) -> list[str]:
     """What a case holds that `scene` does not describe, whatever the case says of itself."""
     wrong: list[str] = []
-    dt_s, radii_m, count = scene.frame_dt_s, np.array(scene.grains.radii_m), scene.grains.count
-    times_s = trajectory.times_s - trajectory.times_s[0]
-    off_s = np.abs(times_s - dt_s * np.arange(trajectory.n_frames))
-    if (off_s > 1e-6 * dt_s).any():
-        frame = int((off_s > 1e-6 * dt_s).argmax())
-        wrong.append(f"frame {frame} is {times_s[frame]:g} s after the first (scene: {frame * dt_s:g} s)")
+    radii_m, count = np.array(scene.grains.radii_m), scene.grains.count
     if (odd := np.abs(trajectory.radius[:, None] / radii_m - 1).min(axis=1) > 1e-9).any():
         grain = int(odd.argmax())
         listed = " or ".join(f"{radius_m:g} m" for radius_m in radii_m)
@@ -202,6 +224,16 @@ def _held_otherwise(trajectory: Trajectory, scene: Scene) -> list[str]:
         elif not same_mesh(stored[name], build_mesh(name, scene.boundary[name])):
             wrong.append(f"boundary.{name}: another mesh stored than the scene's")
     return wrong
+
+
+def _irregular(trajectory: Trajectory, scene: Scene) -> list[str]:
+    """Names the first frame that is not where the scene's frame step puts it."""
+    dt_s, times_s = scene.frame_dt_s, trajectory.times_s - trajectory.times_s[0]
+    off_s = np.abs(times_s - dt_s * np.arange(trajectory.n_frames))
+    if (off_s <= 1e-6 * dt_s).all():
+        return []
+    frame = int((off_s > 1e-6 * dt_s).argmax())
+    return [f"frame {frame} is {times_s[frame]:g} s after the first (scene: {frame * dt_s:g} s)"]
 
 
 def _physics(scene: Scene, varying: Iterable[str]) -> dict[str, Any]:
@@ -226,7 +258,9 @@ class DataModule(pl.LightningDataModule):
     def __init__(self, cases: Split, *, length: int, batch_size: int, seed: int, workers: int) -> None:
         super().__init__()
         self.cases, self.batch_size, self.seed, self.workers = cases, batch_size, seed, workers
-        self.windows = Windows(cases.train, length)
+        recorded, answers = Windows(cases.train, length), Answers(cases.answers)
+        times = max(1, round(len(recorded) / len(answers))) if len(answers) else 0  # about half of all
+        self.windows: ConcatDataset = ConcatDataset([recorded, *[answers] * times])
 
     def train_dataloader(self) -> DataLoader:
         done = self.trainer.global_step if self.trainer else 0

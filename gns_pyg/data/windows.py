@@ -1,6 +1,7 @@
 """Short stretches of consecutive frames: what a model trains on."""
 
 from collections.abc import Iterator, Sequence
+from dataclasses import replace
 
 import numpy as np
 import torch
@@ -59,6 +60,31 @@ class Windows(Dataset):
     def __getitem__(self, item: int) -> Window:
         case = int(np.searchsorted(self.starts, item, side="right")) - 1
         return read_window(self.trajectories[case], item - int(self.starts[case]), self.length)
+
+
+class Answers(Dataset):
+    """The DEM's next frame to states that a model got into by itself; windows as of `Windows`, of length 3.
+
+    Args:
+        files: written by `data_gen.answers`: frames 2 k are such states, frames 2 k + 1 what the DEM made of them.
+    """
+
+    def __init__(self, files: Sequence[Trajectory]) -> None:
+        self.files = list(files)
+        self.starts = np.cumsum([0] + [file.n_frames // 2 for file in self.files])
+
+    def __len__(self) -> int:
+        return int(self.starts[-1])
+
+    def __getitem__(self, item: int) -> Window:
+        number = int(np.searchsorted(self.starts, item, side="right")) - 1
+        file = self.files[number]
+        pair = read_window(file, 2 * (item - int(self.starts[number])), 2)
+        before = {"time_s": pair.time_s - file.scene["frame_dt_s"]}  # a frame before there is none; nothing reads it
+        for name in ("pos", "vel", "ang_vel", "active"):
+            if (values := getattr(pair, name)) is not None:
+                before[name] = torch.cat([values[:1], values])
+        return replace(pair, **before)
 
 
 class UpdateSampler(Sampler):

@@ -24,6 +24,9 @@ class TrainingConfig:
         gradient_clip: largest gradient norm; 0 is no limit.
         region_grains: an update looks at this many neighbouring grains of each window only, so that its memory
             does not grow with the scene; null looks at all.
+        loss_knee: where the loss turns from the square of a scaled error (of mean velocity, end velocity, spin) to its
+            length; 0 is the mean square throughout (the paper).
+        start_from: a bundle whose weights and scales training starts from; null draws and measures them.
         average_decay: the weights' exponential moving average with this decay is what is judged and saved; 0 is none.
     """
 
@@ -37,6 +40,8 @@ class TrainingConfig:
     unroll: int = MISSING
     unroll_from: float = MISSING
     gradient_clip: float = MISSING
+    loss_knee: float = MISSING
+    start_from: str | None = None
     region_grains: int | None = None
     average_decay: float = MISSING
 
@@ -44,7 +49,16 @@ class TrainingConfig:
         for key in ("updates", "batch_size", "lr_start"):
             value = getattr(self, key)
             require(value > 0, f"training.{key}", value, "above 0", f"set training.{key} above 0")
-        for key in ("seed", "halvings", "noise_radii", "noise_velocity", "unroll", "unroll_from", "gradient_clip"):
+        at_least_0 = (
+            "halvings",
+            "noise_radii",
+            "noise_velocity",
+            "unroll",
+            "unroll_from",
+            "gradient_clip",
+            "loss_knee",
+        )
+        for key in ("seed", *at_least_0):
             value = getattr(self, key)
             require(value >= 0, f"training.{key}", value, "at least 0", f"training.{key}=0 turns it off")
         region = self.region_grains

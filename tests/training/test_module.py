@@ -4,7 +4,7 @@ import pytest
 import torch
 
 from gns_pyg.training.config import TrainingConfig
-from gns_pyg.training.module import TrainingModule, perturb
+from gns_pyg.training.module import TrainingModule, mean_loss, perturb
 from tests import scenes
 from tests.simulators import simulator, state_in_box
 
@@ -19,6 +19,7 @@ CONFIG = dict(
     unroll=4,
     unroll_from=0.5,
     gradient_clip=0.0,
+    loss_knee=0.0,
     average_decay=0.9,
 )
 
@@ -59,3 +60,17 @@ def test_unrolling_begins_when_told_and_takes_every_length(monkeypatch):
     assert set(drawn[0]) == {0}
     assert set(drawn[1]) == {0, 1, 2, 3, 4}
     assert drawn[1].count(0) / len(drawn[1]) == pytest.approx(0.5, abs=0.08)
+
+
+def test_the_loss_is_a_square_below_the_knee_and_a_length_above():
+    error = torch.randn(50, 9, generator=torch.Generator().manual_seed(0), dtype=torch.float64)
+    assert mean_loss(error, 0.0).item() == pytest.approx(error.square().mean().item())
+    squares = error.view(50, 3, 3).square().sum(2)
+    assert mean_loss(error, 1e3).item() == pytest.approx((squares / 2e3).mean().item(), rel=1e-4)
+    assert mean_loss(error, 1e-9).item() == pytest.approx(squares.sqrt().mean().item(), rel=1e-6)
+    still = torch.zeros(4, 6, requires_grad=True)
+    for knee in (0.0, 0.02):
+        loss = mean_loss(still, knee)
+        assert loss.item() == 0
+        assert not torch.autograd.grad(loss, still)[0].any()  # finite: no root of zero
+        assert mean_loss(still[:0], knee).item() == 0
