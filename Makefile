@@ -1,4 +1,5 @@
 # make demo: the main job on the embedded real data.   make test: the tests.   make bench: the quick benchmarks' ratios.
+# make results: judges the shipped bundles, writes docs/results.md.
 # All set up .venv first.
 # A plain Python package index serves torch's CUDA build for Linux (several GB). For the small CPU build:
 #   make demo TORCH_INDEX="--index-url https://download.pytorch.org/whl/cpu"
@@ -6,7 +7,7 @@ PYTHON ?= python3
 TORCH_INDEX ?=
 BIN = .venv/bin
 
-.PHONY: setup demo test bench
+.PHONY: setup demo test bench results
 
 setup: .venv/.setup-done
 
@@ -26,6 +27,9 @@ test: setup
 	$(BIN)/ruff format -q --check .
 	$(BIN)/mypy -p gns_pyg -p data_gen
 	$(BIN)/python -m pytest
+
+results: setup
+	OMP_NUM_THREADS=1 $(BIN)/python -m gns_pyg.results
 
 bench: setup
 	OMP_NUM_THREADS=1 $(BIN)/python -m benchmarks

@@ -19,6 +19,7 @@ from data_gen.continuation import continue_dem, frame_at, layout, open_case, sto
 from gns_pyg.config import CONF, require
 from gns_pyg.evaluation.errors import position_error, positions
 from gns_pyg.evaluation.metrics import write_json
+from gns_pyg.evaluation.twins import twins_path
 from gns_pyg.run import entry
 
 log = logging.getLogger(__name__)
@@ -28,7 +29,8 @@ SHOWN = 8  # columns of the printed table
 
 
 def twins(cfg: DictConfig) -> dict[str, Any]:
-    """Runs the pairs that `cfg` describes; prints their distance and writes twins.json.
+    """Runs the pairs that `cfg` describes; prints their distance and writes it beside the case, where evaluation
+    finds it (twins_006.json for case_006.h5), or into `cfg.folder`.
 
     Returns:
         `times_s` (n,); `distance_m` (pairs, n), its mean and (sample) standard deviation over pairs (n,);
@@ -69,7 +71,8 @@ def twins(cfg: DictConfig) -> dict[str, Any]:
         "std_distance_m": distance.std(axis=0, ddof=1) if len(distance) > 1 else np.full(n_frames, np.nan),
         "stored_distance_m": position_error(base, positions(trajectory, frame)),
     }
-    write_json(Path(cfg.folder) / "twins.json", result)
+    path = twins_path(trajectory.path)
+    write_json(path if cfg.folder is None else Path(cfg.folder) / path.name, result)
     log.info("%s\n%s", trajectory.path, table(result))
     return result
 

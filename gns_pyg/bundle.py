@@ -22,6 +22,13 @@ from gns_pyg.scene.requirements import Requirements, check_covers
 from gns_pyg.scene.scene import Scene
 
 FORMAT_VERSION = 2
+SHIPPED = Path(__file__).parent / "bundles"
+
+
+def find(name: str | Path) -> Path:
+    """A bundle's folder: `name` itself, or the bundle of that name that ships with the project."""
+    shipped = SHIPPED / name
+    return shipped if not Path(name).exists() and shipped.is_dir() else Path(name)
 
 
 def save(folder: str | Path, simulator: Simulator, card: Mapping[str, Any]) -> Path:
@@ -58,7 +65,7 @@ def describe(folder: str | Path) -> dict[str, Any]:
     Raises:
         BundleError: if it is missing, not JSON, or of another format version.
     """
-    path = Path(folder) / "bundle.json"
+    path = find(folder) / "bundle.json"
     try:
         description = json.loads(path.read_text())
     except (OSError, ValueError) as error:
@@ -78,7 +85,7 @@ def load(folder: str | Path, scene: Scene | None = None) -> Simulator:
     """Rebuilds the simulator of a bundle, in evaluation mode, on the CPU.
 
     Args:
-        folder: the bundle.
+        folder: the bundle, or the name of one that ships with the project.
         scene: another scene to simulate with the same networks (other gravity, motion, boundary, ...); the bundle's
             own when None.
 
@@ -86,7 +93,7 @@ def load(folder: str | Path, scene: Scene | None = None) -> Simulator:
         BundleError: if a file is missing or damaged, the format version differs, or weights do not fit the model.
         ConfigError: if the other scene needs something that the model does not have.
     """
-    folder, description = Path(folder), describe(folder)
+    folder, description = find(folder), describe(folder)
     own = Scene.from_config(description.get("scene"))
     requires = typed(Requirements, description.get("requires"), "requires")
     model = typed(ModelConfig, description.get("model"), "model")

@@ -3,7 +3,7 @@
 import logging
 import warnings
 from collections.abc import Callable
-from dataclasses import asdict
+from dataclasses import asdict, replace
 from functools import wraps
 from importlib.metadata import version
 from pathlib import Path
@@ -19,7 +19,7 @@ from pytorch_lightning.utilities.exceptions import MisconfigurationException
 from gns_pyg import bundle, machine
 from gns_pyg.config import check_keys, flat, plain, require, typed
 from gns_pyg.data.coverage import coverage, outside_coverage, values
-from gns_pyg.data.datamodule import DataConfig, DataModule, Split, open_case, open_cases, split
+from gns_pyg.data.datamodule import DataConfig, DataModule, Split, find_cases, open_to_compare, split
 from gns_pyg.data.statistics import measure
 from gns_pyg.data.trajectory import Trajectory
 from gns_pyg.dynamics.execution import Execution
@@ -28,12 +28,13 @@ from gns_pyg.dynamics.model_config import ModelConfig
 from gns_pyg.dynamics.simulator import Simulator
 from gns_pyg.errors import ConfigError, GnsError
 from gns_pyg.evaluation.baselines import Climatology, climatology
+from gns_pyg.evaluation.ensemble import roll_out_ensemble
 from gns_pyg.evaluation.judge import judge
 from gns_pyg.evaluation.metrics import strict, write_json
 from gns_pyg.evaluation.predict import start_frame, write_rollout
 from gns_pyg.report.page import write_page
-from gns_pyg.report.plots import write_plots
-from gns_pyg.report.table import metrics_table
+from gns_pyg.report.plots import ensemble_spread, write_figure, write_plots
+from gns_pyg.report.table import ensemble_table, metrics_table
 from gns_pyg.scene.boundary_points import boundary_points
 from gns_pyg.scene.requirements import Requirements, Requires, resolve
 from gns_pyg.scene.scene import Scene
@@ -41,7 +42,7 @@ from gns_pyg.training.config import TrainingConfig
 from gns_pyg.training.module import TrainingModule
 
 GROUPS = ["scene", "model", "requires", "data", "training", "trainer", "callbacks", "logger"]
-TRAIN_KEYS = ["name", "start_s", "ckpt_path", "device", "folder", *GROUPS]
+TRAIN_KEYS = ["name", "start_s", "compare_every_s", "ckpt_path", "device", "folder", *GROUPS]
 log = logging.getLogger(__name__)
 
 
@@ -98,8 +99,10 @@ def train(cfg: DictConfig) -> dict[str, Any]:
     expected = climatology(cases.train, scene)
     card = {"cases": used, "training": plain(cfg.training), "climatology": asdict(expected)}
     card["coverage"] = coverage(scene, cases.train)
+    card["starts"] = [case.start_hash() for case in (*cases.train, *cases.val)]
     bundle.save(folder / "bundle", trained, strict(card))
-    metrics = report(trained, cases.test, expected, cfg, {"bundle": folder / "bundle"})
+    unseen = [open_to_compare(case.path, scene, cfg.compare_every_s) for case in cases.test]
+    metrics = report(trained, unseen, expected, cfg, {"bundle": folder / "bundle"})
     bundle.save(folder / "bundle", trained, strict(card | {"metrics": metrics}))
     return metrics
 
@@ -110,8 +113,7 @@ def evaluate(cfg: DictConfig) -> dict[str, Any]:
     With `scene` that scene's cases are taken and simulated instead: transfer without training.
     """
     simulator, card = load_bundle(cfg), bundle.describe(cfg.bundle)["card"]
-    seen = {digest for purpose in ("train", "val") for digest in card["cases"][purpose].values()}
-    cases = [case for case in open_cases(simulator.scene, cfg.data.dir) if case.content_hash() not in seen]
+    cases = unseen_cases(simulator.scene, cfg.data.dir, card, cfg.compare_every_s)
     for case in cases:
         warn_outside(simulator.scene, case, start_frame(case, cfg.start_s), card)
     return report(simulator, cases, Climatology.from_plain(card["climatology"]), cfg, {})
@@ -120,13 +122,43 @@ def evaluate(cfg: DictConfig) -> dict[str, Any]:
 def rollout(cfg: DictConfig) -> dict[str, Any]:
     """Rolls a bundle out from a recorded case and writes the trajectory in the data's own format."""
     simulator, card = load_bundle(cfg), bundle.describe(cfg.bundle)["card"]
-    require(cfg.trajectory is not None, "trajectory", "null", "a case file", "e.g. trajectory=data/hopper/case_016.h5")
-    trajectory = open_case(cfg.trajectory, simulator.scene)
+    if cfg.trajectory is None:
+        unseen = unseen_cases(simulator.scene, None, card, None)
+        require(
+            bool(unseen), "trajectory", "null, and no unseen case", "a case file", "trajectory=data/hopper/case_016.h5"
+        )
+        trajectory = unseen[0]
+        log.info("from the unseen case %s", trajectory.path)
+    else:
+        trajectory = open_to_compare(cfg.trajectory, simulator.scene)
     path, start = Path(cfg.folder) / "rollout.h5", start_frame(trajectory, cfg.start_s)
     warn_outside(simulator.scene, trajectory, start, card)
+    if cfg.ensemble is not None:
+        return roll_out_members(simulator, trajectory, start, cfg)
     seconds = write_rollout(simulator, trajectory, start, path)
     log.info("%.3g s per simulated second -> %s", seconds, path)
     return {"rollout": str(path), "speed/seconds_per_simulated_second": seconds}
+
+
+def roll_out_members(simulator: Simulator, case: Trajectory, start: int, cfg: DictConfig) -> dict[str, Any]:
+    """Rolls out `ensemble` copies of a start; writes ensemble.json and a picture, prints the scores."""
+    members, folder = cfg.ensemble, Path(cfg.folder)
+    require(isinstance(members, int) and members >= 2, "ensemble", members, "at least 2 members", "e.g. ensemble=16")
+    ensemble = roll_out_ensemble(simulator, case, start, members)
+    write_json(folder / "ensemble.json", ensemble.plain())
+    title = f"{simulator.scene.name}, {case.path.stem}: {members} roll-outs that start a micrometre apart"
+    write_figure(ensemble_spread(ensemble, title), folder / "plots" / "ensemble")
+    log.info("\n%s", ensemble_table(ensemble, title, {"run folder": folder, "picture": folder / "plots/ensemble.png"}))
+    return {f"crps/{name}": score for name, score in ensemble.crps().items()}
+
+
+def unseen_cases(scene: Scene, folder: str | None, card: dict[str, Any], every_s: float | None) -> list[Trajectory]:
+    """The cases of a scene (see `open_to_compare`) that a bundle was neither trained nor validated on: neither their
+    content nor, however they were recorded, their start is that of one that it was."""
+    seen = {digest for purpose in ("train", "val") for digest in card["cases"][purpose].values()}
+    seen |= set(card.get("starts", []))  # bundles made before have none
+    cases = [open_to_compare(path, scene, every_s) for path in find_cases(scene, folder)]
+    return [case for case in cases if not seen & {case.content_hash(), case.start_hash()}]
 
 
 def warn_outside(scene: Scene, case: Trajectory, start: int, card: dict[str, Any]) -> None:
@@ -245,11 +277,12 @@ def report(
     simulator: Simulator, cases: list[Trajectory], expected: Climatology, cfg: DictConfig, places: dict[str, Path]
 ) -> dict[str, Any]:
     """Judges a simulator on unseen cases; writes metrics.json, cases.json, plots and page; prints the table."""
-    folder, scene = Path(cfg.folder), simulator.scene
+    folder = Path(cfg.folder)
     if not cases:
         log.info("no unseen case, so nothing to judge the model by")
         write_json(folder / "metrics.json", {})
         return {}
+    scene = replace(simulator.scene, frame_dt_s=cases[0].frame_dt_s)  # of what is compared
     evaluation = judge(simulator, cases, expected, cfg.start_s)
     metrics = evaluation.metrics | {
         "speed/threads": torch.get_num_threads(),

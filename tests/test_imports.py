@@ -16,6 +16,7 @@ BELOW["bundle"] = BELOW["dynamics"]
 BELOW["evaluation"] = {"evaluation", "bundle"} | BELOW["data"]
 BELOW["training"] = {"training"} | BELOW["evaluation"]
 BELOW["report"] = {"report"} | BELOW["evaluation"]
+BELOW["results"] = {"results"} | BELOW["report"]
 BELOW["run"] = {*BELOW, "run"}
 IN_YADE = {"data/schema.py": {"errors"}, "data/trajectory.py": {"errors", "data"}, "scene/travel.py": set()}
 FILES = sorted(path for path in PACKAGE.rglob("*.py") if "conf" not in path.relative_to(PACKAGE).parts)

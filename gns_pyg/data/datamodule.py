@@ -3,7 +3,7 @@
 import math
 import os
 from collections.abc import Iterable, Sequence
-from dataclasses import asdict, dataclass, field
+from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
@@ -102,6 +102,30 @@ def open_case(path: str | Path, scene: Scene) -> Trajectory:
     check_same_scene(trajectory, scene)
     check_inside(trajectory, scene)
     return trajectory
+
+
+def open_to_compare(path: str | Path, scene: Scene, every_s: float | None = None) -> Trajectory:
+    """Opens a case whose frames may lie further apart than the steps of a simulator of `scene`: what it did in
+    between is not compared.
+
+    Args:
+        path: the case.
+        scene: the simulator's.
+        every_s: reads only the frames so many seconds apart; None: every recorded one that the simulator reaches.
+
+    Raises:
+        ConfigError: if `every_s` is no whole number of steps, or steps lie between frames of a scene with an inlet.
+        DataError: see `open_case`.
+    """
+    wanted_s = max(scene.frame_dt_s, Trajectory(path).frame_dt_s) if every_s is None else every_s
+    known = isinstance(wanted_s, int | float) and wanted_s > 0
+    steps = wanted_s / scene.frame_dt_s if known else 0.0
+    whole = known and round(steps) >= 1 and abs(steps - round(steps)) < 1e-6
+    step = f"a whole number of the simulator's steps of {scene.frame_dt_s:g} s"
+    require(whole, "compare_every_s", every_s or f"frames of {path} {wanted_s:g} s apart", step, "e.g. 0.01")
+    found = f"{wanted_s:g} s in a scene with an inlet"
+    require(scene.inlet is None or round(steps) == 1, "compare_every_s", found, "every step", "leave it null")
+    return open_case(path, replace(scene, frame_dt_s=round(steps) * scene.frame_dt_s))
 
 
 def open_cases(scene: Scene, folder: str | None) -> list[Trajectory]:

@@ -115,6 +115,12 @@ class Trajectory:
         whole = self if self.every == 1 else Trajectory(self.path)
         return hashlib.sha256(np.ascontiguousarray(whole.read("position")).tobytes()).hexdigest()[:16]
 
+    def start_hash(self) -> str:
+        """A hash of the first frame's positions: the same run, recorded at other times or for longer, has the same."""
+        digits = self.scene["dem"]["decimals"]["position"]
+        start = np.rint(self.read("position", 0, 1) * 10**digits).astype(np.int64)
+        return hashlib.sha256(start.tobytes()).hexdigest()[:16]
+
     def __getstate__(self) -> dict[str, Any]:
         return {**self.__dict__, "_file": None}
 

@@ -26,7 +26,10 @@ from gns_pyg.evaluation.observables import (
     outflow,
     time_mean,
 )
+from gns_pyg.evaluation.twins import Twins, horizon, read_twins
 from gns_pyg.scene.scene import Scene
+
+LATE_S = 1.0  # from here on a roll-out's error is compared with the twins'
 
 
 @dataclass(frozen=True)
@@ -43,6 +46,7 @@ class CaseResult:
         one_step_error_m: (n,) m, the model's mean position error there.
         trivial_error_m: name of a trivial predictor -> (n,) m, its error at the same frames.
         seconds_per_simulated_second: wall clock of the roll-out.
+        twins: distance of DEM twins, or None where none are stored with the case.
         yade_seconds_per_simulated_second, yade_cores, yade_dt_s: the DEM run's time, cores and time step. On one core
             its processor time is taken: on an idle machine the wall clock, and no longer on a busy one.
     """
@@ -60,6 +64,7 @@ class CaseResult:
     yade_seconds_per_simulated_second: float
     yade_cores: int
     yade_dt_s: float
+    twins: Twins | None = None
 
 
 def case_result(
@@ -128,6 +133,7 @@ def case_result(
         yade_seconds_per_simulated_second=_dem_seconds(run) / span_s,
         yade_cores=int(run["cores"]),
         yade_dt_s=float(run["dt_s"]),
+        twins=read_twins(trajectory, trajectory.times_s[start_frame:stop]),
     )
 
 
@@ -221,6 +227,9 @@ def evaluate_cases(results: Sequence[CaseResult], climatology: Climatology, scen
       all test cases, at the same frames.
     - `test/rollout_error_final_m`: position error at the last frame, `test/rollout_error_final_frozen_m`: of grains
       frozen at the roll-out's start.
+    - `test/rollout_error_final_twin_m`, `test/rollout_error_over_twin`: the distance of DEM twins at the last frame,
+      and the roll-out's error over it, mean over frames from 1 s on; `test/horizon_s`, `test/horizon_twin_s`: see
+      `twins.horizon`. Absent unless every case has its twins.
     - `test/center_of_mass_error_max_m`: largest 3D distance over frames of the roll-out; `..._frozen_max_m`,
       `..._climatology_max_m`: the same for the start's centre of mass and the training cases' mean curve.
     - `test/angle_of_repose_deg`, `test/angle_of_repose_dem_deg`: time mean from `from_s` on; their
@@ -247,7 +256,7 @@ def evaluate_cases(results: Sequence[CaseResult], climatology: Climatology, scen
     trivial_name, trivial = best_trivial([result.trivial_error_m for result in results])
     cases = [_evaluate_case(result, trivial_name, climatology, scene) for result in results]
     metrics: dict[str, Any] = {}
-    for key in cases[0].metrics:
+    for key in (key for key in cases[0].metrics if all(key in case.metrics for case in cases)):
         values = np.array([case.metrics[key] for case in cases], np.float64)
         if key == "test/escaped_grains":
             metrics[key] = int(values.sum())
@@ -281,6 +290,14 @@ def _evaluate_case(result: CaseResult, trivial_name: str, climatology: Climatolo
         "test/center_of_mass_error_frozen_max_m": _largest_distance(center[:1], center),
         "test/center_of_mass_error_climatology_max_m": climatology.center_of_mass_error_m(result.times_s, center),
     }
+    if result.twins is not None:
+        late = result.times_s >= LATE_S - 1e-9
+        metrics |= {
+            "test/rollout_error_final_twin_m": float(result.twins.mean_m[-1]),
+            "test/rollout_error_over_twin": nanmean(error[late] / result.twins.mean_m[late]),
+            "test/horizon_s": horizon(error, result.times_s, result.twins),
+            "test/horizon_twin_s": horizon(result.twins.mean_m, result.times_s, result.twins),
+        }
     if dem.angle_of_repose_deg is not None and model.angle_of_repose_deg is not None:
         steady = slice(from_frame(result.times_s, scene), None)
         angle, angle_error = time_mean(model.angle_of_repose_deg[steady])

@@ -4,8 +4,9 @@ import time
 from collections import deque
 from collections.abc import Callable
 from concurrent.futures import Future, ThreadPoolExecutor
-from dataclasses import asdict
+from dataclasses import asdict, fields, replace
 from importlib.metadata import version
+from itertools import islice
 from pathlib import Path
 from typing import Any
 
@@ -45,9 +46,53 @@ def start_frame(trajectory: Trajectory, start_s: Any) -> int:
     return frame
 
 
+def steps_per_frame(simulator: Simulator, trajectory: Trajectory) -> int:
+    """The simulator's steps from one frame of a case to the next.
+
+    Raises:
+        ConfigError: if there are several, but the state holds differences of successive frames.
+    """
+    steps = max(1, round(trajectory.frame_dt_s / simulator.scene.frame_dt_s))
+    fits = steps == 1 or simulator.requires.state != "differences"
+    found = f"frames {trajectory.frame_dt_s:g} s apart, steps of {simulator.scene.frame_dt_s:g} s, state differences"
+    require(fits, str(trajectory.path), found, "frames one step apart", "record the case with the bundle's frame_dt_s")
+    return steps
+
+
 def initial_state(simulator: Simulator, trajectory: Trajectory, frame: int) -> State:
     """The recorded state at `frame`."""
-    return simulator.integrator.read(read_window(trajectory, frame - 1, 2), 1)
+    return _recorded(simulator, trajectory, range(frame - 1, frame), 2)[0]
+
+
+def perturbed(state: State, copies: int, shift_m: float, seed: int) -> State:
+    """`copies` of a single graph's state as one batch, every coordinate of every grain shifted at random.
+
+    Args:
+        state: n_grains grains of one graph.
+        copies: how many.
+        shift_m: standard deviation of the shifts, m.
+        seed: of the shifts.
+
+    Returns:
+        copies * n_grains grains of `copies` graphs.
+    """
+    generator = torch.Generator().manual_seed(seed)
+    repeated = {
+        field.name: value.repeat(copies, *[1] * (value.dim() - 1))
+        for field in fields(state)
+        if isinstance(value := getattr(state, field.name), torch.Tensor)
+    }
+    shift = torch.randn(repeated["pos"].shape, generator=generator, dtype=state.pos.dtype)
+    repeated["pos"] = repeated["pos"] + shift_m * shift
+    repeated["batch"] = torch.arange(copies).repeat_interleave(len(state.pos))
+    return replace(state, **repeated)
+
+
+def _recorded(simulator: Simulator, trajectory: Trajectory, frames: range, length: int) -> tuple[State, Window]:
+    """The recorded states one frame after `frames`, batched, and the windows of `length` frames that begin there."""
+    window = Window.collate([read_window(trajectory, frame, length) for frame in frames])
+    times_s = torch.from_numpy(trajectory.times_s[frames.start + 1 : frames.stop + 1])
+    return replace(simulator.integrator.read(window, 1), time_s=times_s), window
 
 
 def write_rollout(simulator: Simulator, trajectory: Trajectory, start: int, path: Path) -> float:
@@ -59,7 +104,7 @@ def write_rollout(simulator: Simulator, trajectory: Trajectory, start: int, path
         Wall seconds per simulated second, without the writing.
     """
     scene, n_steps, state = (
-        simulator.scene,
+        replace(simulator.scene, frame_dt_s=steps_per_frame(simulator, trajectory) * simulator.scene.frame_dt_s),
         trajectory.n_frames - 1 - start,
         initial_state(simulator, trajectory, start),
     )
@@ -81,15 +126,15 @@ def write_rollout(simulator: Simulator, trajectory: Trajectory, start: int, path
             if len(waiting) > MOST_WAITING:
                 waiting.popleft().result()
 
-        seconds = _run(simulator, state, n_steps, hand_over)
+        seconds = _run(simulator, state, n_steps, steps_per_frame(simulator, trajectory), hand_over)
         for frame in waiting:
             frame.result()
         writer.finish(
             {
                 "wall_clock_s": seconds,
                 "cores": torch.get_num_threads(),
-                "steps": n_steps,
-                "dt_s": scene.frame_dt_s,
+                "steps": n_steps * steps_per_frame(simulator, trajectory),
+                "dt_s": simulator.scene.frame_dt_s,
                 "creator": "gns_pyg",
                 "creator_version": version("gns_pyg"),
                 "start_from": trajectory.path.name,
@@ -105,25 +150,38 @@ def roll_out(simulator: Simulator, trajectory: Trajectory, start: int) -> tuple[
         Positions, m, (n_frames - start, n_grains, 3), the start first, nan where a grain is absent, and wall seconds
         per simulated second.
     """
-    n_steps = trajectory.n_frames - 1 - start
-    pos = np.full((n_steps + 1, trajectory.n_grains, 3), np.nan)
-
-    def keep(step: int, state: State) -> None:
-        there = slice(None) if state.active is None else state.active.numpy()
-        pos[step, there] = state.pos.numpy()[there]
-
-    seconds = _run(simulator, initial_state(simulator, trajectory, start), n_steps, keep)
-    return pos, seconds / (n_steps * simulator.scene.frame_dt_s)
+    pos, seconds = roll_out_from(simulator, trajectory, start, initial_state(simulator, trajectory, start))
+    return pos[0], seconds
 
 
-def _run(simulator: Simulator, state: State, n_steps: int, see: Callable[[int, State], None]) -> float:
-    """Shows `see` the state and the `n_steps` that follow it, on the CPU; returns the wall seconds of the roll-out."""
+def roll_out_from(simulator: Simulator, trajectory: Trajectory, start: int, state: State) -> tuple[np.ndarray, float]:
+    """Rolls out from `state`, one or more copies of a case's grains at its frame `start`, to the case's end.
+
+    Returns:
+        Positions, m, (copies, n_frames - start, n_grains, 3), the start first, nan where a grain is absent, and wall
+        seconds per simulated second, of all copies together.
+    """
+    n_frames = trajectory.n_frames - start
+    pos = np.full((state.n_graphs, n_frames, trajectory.n_grains, 3), np.nan)
+
+    def keep(frame: int, state: State) -> None:
+        there = torch.ones_like(state.batch, dtype=torch.bool) if state.active is None else state.active
+        shape = (state.n_graphs, trajectory.n_grains, 3)
+        pos[:, frame] = torch.where(there[:, None], state.pos, torch.nan).numpy().reshape(shape)
+
+    seconds = _run(simulator, state, n_frames - 1, steps_per_frame(simulator, trajectory), keep)
+    return pos, seconds / ((n_frames - 1) * trajectory.frame_dt_s)
+
+
+def _run(simulator: Simulator, state: State, n_frames: int, steps: int, see: Callable[[int, State], None]) -> float:
+    """Shows `see` the state and the `n_frames` that follow it, each `steps` steps after the last, on the CPU; returns
+    the wall seconds of the roll-out."""
     see(0, state)
     step = Captured(simulator) if simulator.execution.capture else simulator
-    states, seconds = rollout(step, state.to(simulator.scale.device), n_steps), 0.0
-    for number in range(1, n_steps + 1):
+    states, seconds = rollout(step, state.to(simulator.scale.device), n_frames * steps), 0.0
+    for number in range(1, n_frames + 1):
         begin = time.perf_counter()
-        following = next(states).to("cpu")
+        following = deque(islice(states, steps), maxlen=1)[0].to("cpu")
         seconds += time.perf_counter() - begin
         see(number, following)
     return seconds
@@ -131,15 +189,17 @@ def _run(simulator: Simulator, state: State, n_steps: int, see: Callable[[int, S
 
 @torch.inference_mode()
 def one_step_errors(simulator: Simulator, trajectory: Trajectory, batch_size: int = 4) -> np.ndarray:
-    """Mean position error (the paper's (13)), m, of one step from every recorded state: of frames 2 to the last, over
+    """Mean position error (the paper's (13)), m, one frame after every recorded state: of frames 2 to the last, over
     the grains present in the frame and the two before it (see `trivial_errors`)."""
-    errors = []
+    errors, steps = [], steps_per_frame(simulator, trajectory)
     for first in range(0, trajectory.n_frames - 2, batch_size):
         frames = range(first, min(first + batch_size, trajectory.n_frames - 2))
-        window = Window.collate([read_window(trajectory, frame, 3) for frame in frames]).to(simulator.scale.device)
-        predicted, truth = simulator(simulator.integrator.read(window, 1)).pos, window.pos[2]
+        state, window = _recorded(simulator, trajectory, frames, 3)
+        state, truth = state.to(simulator.scale.device), window.pos[2]
+        for _ in range(steps):
+            state = simulator(state)
         if window.active is not None:
             truth = torch.where(window.active.all(dim=0)[:, None], truth, torch.nan)
         shape = (len(frames), trajectory.n_grains, 3)
-        errors.append(position_error(predicted.cpu().numpy().reshape(shape), truth.cpu().numpy().reshape(shape)))
+        errors.append(position_error(state.pos.cpu().numpy().reshape(shape), truth.numpy().reshape(shape)))
     return np.concatenate(errors)

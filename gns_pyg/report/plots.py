@@ -16,6 +16,7 @@ from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 from trimesh import Trimesh
 
+from gns_pyg.evaluation.ensemble import Ensemble
 from gns_pyg.evaluation.errors import mean_present, present
 from gns_pyg.evaluation.metrics import CaseEvaluation, Evaluation, Observables
 from gns_pyg.evaluation.observables import finite_difference_velocity
@@ -37,14 +38,16 @@ SPEED_QUANTILE = 0.99  # the colour scale ends here, so that one fast grain does
 
 def write_plots(evaluation: Evaluation, scene: Scene, folder: str | Path) -> list[Path]:
     """Writes every figure of `draw` into `folder`; returns the files, per figure PNG then SVG."""
-    folder = Path(folder)
-    folder.mkdir(parents=True, exist_ok=True)
-    files = []
-    for name, figure in draw(evaluation, scene).items():
-        for ending in ("png", "svg"):
-            path = folder / f"{name}.{ending}"
-            figure.savefig(path, dpi=150)
-            files.append(path)
+    drawn = draw(evaluation, scene)
+    return [file for name, figure in drawn.items() for file in write_figure(figure, Path(folder) / name)]
+
+
+def write_figure(figure: Figure, path: Path) -> list[Path]:
+    """Writes a figure as `path`.png and `path`.svg; returns both."""
+    path.parent.mkdir(parents=True, exist_ok=True)
+    files = [path.with_name(f"{path.name}.{ending}") for ending in ("png", "svg")]
+    for file in files:
+        figure.savefig(file, dpi=150)
     return files
 
 
@@ -74,6 +77,13 @@ def rollout_error(evaluation: Evaluation, scene: Scene) -> Figure:
     axes.plot(*_mean_curve(evaluation, lambda case: case.error_m, 1e3), color=BLUE, linewidth=2.2, label="network")
     frozen = _mean_curve(evaluation, lambda case: case.frozen_error_m, 1e3)
     axes.plot(*frozen, color=ORANGE, linewidth=1.6, linestyle="-.", label="frozen at the start")
+    label: str | None = "DEM twins, a micrometre apart"
+    for result in (case.result for case in evaluation.cases):
+        if result.twins is not None:
+            mean, std = 1e3 * result.twins.mean_m, 1e3 * result.twins.std_m
+            axes.fill_between(result.times_s, mean - std, mean + std, color=GREEN, alpha=0.25, linewidth=0)
+            axes.plot(result.times_s, mean, color=GREEN, linewidth=1.2, linestyle="--", label=label)
+            label = None  # once in the legend
     if scene.name in PAPER_FINAL_ERROR_MM:
         final = PAPER_FINAL_ERROR_MM[scene.name]
         axes.axhline(final, color="0.35", linestyle=":", label=f"paper's network at the end: {final:g} mm")
@@ -217,6 +227,28 @@ def snapshots(case: CaseEvaluation, scene: Scene, n_times: int = 4) -> Figure:
         axes.set_title(f"t = {result.times_s[frame]:.2f} s", fontsize=10)
     figure.colorbar(grains, ax=grid, label="speed (m/s)", shrink=0.7, extend="max", pad=0.02)
     figure.suptitle(f"{scene.name}, test case {result.name}: DEM and network from the same start", fontsize=11)
+    return figure
+
+
+def ensemble_spread(ensemble: Ensemble, title: str) -> Figure:
+    """Every observable of an ensemble against time: mean and spread of the members, and DEM's own."""
+    n_columns = 3
+    n_rows = -(-len(ensemble.members) // n_columns)
+    figure = _bare_figure((3.6 * n_columns, 2.5 * n_rows))
+    grid = figure.subplots(n_rows, n_columns, squeeze=False, sharex=True).flat
+    for axes, (name, members) in zip(grid, ensemble.members.items(), strict=False):
+        mean, std = members.mean(axis=0), members.std(axis=0, ddof=1)
+        axes.fill_between(ensemble.times_s, mean - 2 * std, mean + 2 * std, color=BLUE, alpha=0.25, linewidth=0)
+        axes.plot(ensemble.times_s, mean, color=BLUE, linestyle=NETWORK, linewidth=1.4, label="network, mean +- 2 std")
+        axes.plot(ensemble.times_s, ensemble.dem[name], color="black", linestyle=DEM, linewidth=1.0, label="DEM")
+        axes.set_title(name, fontsize=9)
+        axes.grid(color="0.88", linewidth=0.6)
+        axes.spines[["top", "right"]].set_visible(False)
+    for axes in list(grid):  # places left over
+        axes.set_visible(False)
+    figure.axes[0].legend(frameon=False, fontsize=8)
+    figure.supxlabel("time (s)", fontsize=10)
+    figure.suptitle(title, fontsize=11)
     return figure
 
 

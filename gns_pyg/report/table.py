@@ -4,7 +4,11 @@ import math
 from collections.abc import Mapping
 from typing import Any
 
+from gns_pyg.evaluation.ensemble import Ensemble
+from gns_pyg.evaluation.errors import nanmean
+
 MISSING = "-"
+TWIN = "test/rollout_error_final_twin_m"
 OBSERVED = [  # what, key, factor, unit
     ("overlap, 99.9th percentile", "test/overlap_ratio_999", 100.0, " %"),
     ("coordination number", "test/coordination_number", 1.0, ""),
@@ -56,7 +60,19 @@ def metric_rows(metrics: Mapping[str, Any]) -> list[tuple[str, str, str]]:
         (
             "roll-out error, last frame",
             millimetres("test/rollout_error_final_m"),
-            f"{millimetres('test/rollout_error_final_frozen_m')} frozen",
+            f"{millimetres('test/rollout_error_final_frozen_m')} frozen"
+            + (f", {millimetres(TWIN)} DEM twins" if TWIN in metrics else ""),
+        ),
+        *(
+            [
+                (
+                    "predictability horizon",
+                    _number(metrics.get("test/horizon_s"), 1.0, " s"),
+                    f"{_number(metrics.get('test/horizon_twin_s'), 1.0, ' s')} DEM twins",
+                )
+            ]
+            if TWIN in metrics
+            else []
         ),
         (
             "centre of mass error, largest",
@@ -117,6 +133,19 @@ def metric_rows(metrics: Mapping[str, Any]) -> list[tuple[str, str, str]]:
         ),
     ]
     return rows
+
+
+def ensemble_table(ensemble: Ensemble, title: str, places: Mapping[str, object]) -> str:
+    """Every observable, mean over the roll-out: of DEM, of the members, their spread, and the CRPS."""
+    rows = [("mean over the roll-out", "network", "beside")]
+    scores = ensemble.crps()
+    for name, members in ensemble.members.items():
+        spread = nanmean(members.std(axis=0, ddof=1))
+        own, dem = nanmean(members), nanmean(ensemble.dem[name])
+        beside = f"{_number(dem, 1.0, '')} DEM; CRPS {_number(scores[name], 1.0, '')}"
+        rows.append((name, f"{_number(own, 1.0, '')} \N{PLUS-MINUS SIGN} {_number(spread, 1.0, '')}", beside))
+    rows.append(("escaped grains, most of any member", _count(ensemble.escaped), ""))
+    return "\n".join([title, _grid(rows), *(f"{what}: {where}" for what, where in places.items())])
 
 
 def _grid(rows: list[tuple[str, str, str]]) -> str:

@@ -139,7 +139,7 @@ class TestWithYade:
 
     def test_twins_start_a_micrometre_apart(self, rolling, tmp_path) -> None:
         result = twins(config(tmp_path, *FEW, f"data.dir={rolling}", "start_s=0.03", "pairs=1", name="twins"))
-        stored = json.loads((tmp_path / "twins.json").read_text(), parse_constant=pytest.fail)
+        stored = json.loads((tmp_path / "twins_000.json").read_text(), parse_constant=pytest.fail)
         assert stored["times_s"] == pytest.approx([0.03, 0.04, 0.05])
         assert np.shape(stored["distance_m"]) == (1, 3)
         assert stored["mean_distance_m"] == stored["distance_m"][0]

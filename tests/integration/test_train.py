@@ -13,7 +13,7 @@ import torch
 from gns_pyg import bundle, run
 from gns_pyg.config import CONF
 from gns_pyg.data.datamodule import EMBEDDED, DataConfig, split
-from gns_pyg.data.trajectory import Trajectory
+from gns_pyg.data.trajectory import Trajectory, TrajectoryWriter
 from gns_pyg.errors import BundleError, ConfigError, DataError, NumericalError
 from gns_pyg.evaluation.metrics import strict
 from gns_pyg.evaluation.predict import initial_state
@@ -31,7 +31,7 @@ def weights(folder):
 
 @pytest.mark.parametrize("experiment", EXPERIMENTS)
 def test_every_experiment_composes_and_takes_a_training_step(experiment, tmp_path):
-    small = {"hopper": "hopper_small", "drum": "drum_small"}[experiment.split("_")[-1]]
+    small = {"hopper": "hopper_small", "drum": "drum_small"}.get(name := experiment.removeprefix("paper_"), name)
     metrics = train(
         tmp_path, f"experiment={experiment}", f"scene={small}", "training.updates=1", "data.test_fraction=0"
     )
@@ -257,3 +257,19 @@ def test_bad_config_is_one_clear_error_and_leaves_no_output(override, error, mat
         train(tmp_path, "experiment=hopper", override)
     assert not (tmp_path / "metrics.json").exists()
     assert not (tmp_path / "bundle").exists()
+
+
+def test_the_same_run_recorded_otherwise_is_not_unseen(trained, tmp_path):
+    """A copy of a training case with fewer frames has another content, but the same start."""
+    case = Trajectory(EMBEDDED / "hopper_small" / "case_000.h5")
+    (tmp_path / "cases").mkdir()
+    shape = [case.radius, case.mass, case.boundary, case.scene["dem"]["decimals"]]
+    with TrajectoryWriter(tmp_path / "cases" / "case_000.h5", case.scene, *shape) as writer:
+        for frame in range(case.n_frames - 1):
+            fields = (case.read(name, frame, frame + 1)[0] for name in ("position", "velocity", "angular_velocity"))
+            writer.append(frame, float(case.times_s[frame]), *fields)
+        writer.finish(case.run)
+    again = config(
+        tmp_path / "run", f"bundle={trained[0] / 'bundle'}", f"data.dir={tmp_path / 'cases'}", name="evaluate"
+    )
+    assert run.evaluate(again) == {}

@@ -1,0 +1,168 @@
+"""docs/results.md from docs/results.json: every figure beside what it is to be held against, and whether it holds."""
+
+import math
+from collections.abc import Callable, Mapping
+from typing import Any
+
+SCORES = {"hopper": 3.0e-4, "drum": 4.0e-4, "inclined_drum": 4.0e-4}  # goal of the one-step error, m
+Z_95 = 1.96
+CAPTIONS = {
+    "one_step_error": "one-step error along the run",
+    "rollout_error": "position error of the roll-out, beside DEM twins",
+    "center_of_mass": "height of the centre of mass",
+    "angle_of_repose": "angle of repose",
+    "mean_speed": "mean speed",
+    "granular_temperature": "granular temperature",
+    "overlap": "overlap",
+    "snapshots": "DEM and network from the same start",
+    "ensemble": "ensemble: mean and spread beside DEM",
+}
+HEAD = """# Results
+
+Written by `make results` from [results.json](results.json): the bundles that ship with the project, on embedded Yade
+cases that they have not seen. These are the reduced scenes (220 to 300 grains), not the paper's; what was tried at full
+size, and how these bundles came about, is in [experiments.md](experiments.md) and [answers.md](answers.md). Means over
+unseen cases, ± the standard deviation over them; roll-outs from 0.1 s to the case's end, read every 10 ms. The last
+column says whether the goal that we set ourselves holds, on this scene and these cases.
+"""
+
+
+def results_page(found: Mapping[str, Any]) -> str:
+    """The page, Markdown.
+
+    Args:
+        found: scene name -> what `gns_pyg.results.results` found, as plain JSON values.
+    """
+    return "\n".join([HEAD, *(_scene(name, values) for name, values in found.items())])
+
+
+def _scene(name: str, values: Mapping[str, Any]) -> str:
+    m, spread, scatter = values["metrics"], values["spread"], values["seed_scatter"]
+    own, yade = m["speed/seconds_per_simulated_second"], m["speed/yade_seconds_per_simulated_second"]
+    lines = [
+        f"## {name} (`bundle={values['bundle']}`)\n",
+        f"Trained on {values['trained_on']} cases; {len(values['cases'])} unseen. {own:.2g} s per simulated second on "
+        f"one thread of an {m['speed/device']}; Yade {yade:.2g} s at a step of {1e6 * m['speed/yade_dt_s']:.0f} µs on "
+        f"one core: the network takes {own / yade:.2g} times Yade's time.\n",
+        "| | network | beside | goal | holds |",
+        "|---|---|---|---|---|",
+        *_rows(values["bundle"], m, spread, scatter),
+    ]
+    lines += [
+        f"\n{values['ensemble']['members']} roll-outs a micrometre apart, first unseen case; CRPS (mean over frames): "
+        + ", ".join(f"{key} {score:.3g}" for key, score in values["ensemble"]["crps"].items())
+        + f". Escaped grains, most of any member: {values['ensemble']['escaped_grains']}."
+    ]
+    if values["held_out"]:
+        lines += [
+            "\nConditions it was never trained on, two cases each, beside the training cases' mean (climatology).\n",
+            "| condition | one step, mm (trivial) | centre of mass, mm (climatology) | angle error, degrees "
+            "(climatology) | mean speed, m/s (DEM) | escaped | better than climatology in both |",
+            "|---|---|---|---|---|---|---|",
+            *(_condition(condition, metrics) for condition, metrics in values["held_out"].items()),
+        ]
+    lines += ["", *(f"![{text}](figures/results_{values['bundle']}_{key}.png)" for key, text in CAPTIONS.items()), ""]
+    return "\n".join(lines)
+
+
+def _rows(bundle: str, m: Mapping[str, Any], spread: Mapping[str, Any], scatter: Mapping[str, Any]) -> list[str]:
+    """Rows of what can be said of the scene."""
+
+    def value(key: str, factor: float, unit: str) -> str:
+        return f"{_text(m[key], factor)} ± {_text(spread.get(key), factor)} {unit}"
+
+    def row(what: str, own: str, beside: str, goal: str, holds: bool) -> str:
+        return f"| {what} | {own} | {beside} | {goal} | {'yes' if holds else '**no**'} |"
+
+    def against_dem(what: str, key: str, factor: float, unit: str, goal: str, holds: Callable[[float], bool]) -> str:
+        ratio = m[key] / m[f"{key}_dem"]
+        return row(
+            what, value(key, factor, unit), f"DEM {_text(m[f'{key}_dem'], factor)}: {ratio:.2f}", goal, holds(ratio)
+        )
+
+    step, trivial = m["test/one_step_error_m"], m["test/one_step_error_trivial_m"]
+    most, center = SCORES[bundle], m["test/center_of_mass_error_max_m"]
+    climatology = m["test/center_of_mass_error_climatology_max_m"]
+    rows = [
+        row(
+            "one-step error (10 ms)",
+            value("test/one_step_error_m", 1e3, "mm"),
+            f"best trivial {_text(trivial, 1e3)} mm: {step / trivial:.2f}",
+            f"at most 0.45 of it and {1e3 * most:g} mm",
+            step <= min(most, 0.45 * trivial),
+        ),
+        row(
+            "centre of mass, largest error",
+            value("test/center_of_mass_error_max_m", 1e3, "mm"),
+            f"climatology {_text(climatology, 1e3)} mm",
+            "at most 4 mm and 0.7 of climatology's",
+            center <= min(4e-3, 0.7 * climatology),
+        ),
+    ]
+    if "test/rollout_error_over_twin" in m:
+        ratio, reach = m["test/rollout_error_over_twin"], m["test/horizon_s"] / m["test/horizon_twin_s"]
+        rows += [
+            row(
+                "roll-out error, last frame",
+                value("test/rollout_error_final_m", 1e3, "mm"),
+                f"twins {_text(m['test/rollout_error_final_twin_m'], 1e3)} mm; over twins' from 1 s on: {ratio:.2f}",
+                "0.85 to 1.15 of the twins'",
+                0.85 <= ratio <= 1.15,
+            ),
+            row(
+                "predictability horizon",
+                value("test/horizon_s", 1.0, "s"),
+                f"twins {_text(m['test/horizon_twin_s'], 1.0)} s: {reach:.2f}",
+                "at least 0.6 of the twins'",
+                reach >= 0.6,
+            ),
+        ]
+    if "test/angle_of_repose_deg" in m:
+        off = m["test/angle_of_repose_deg"] - m["test/angle_of_repose_dem_deg"]
+        error = math.hypot(
+            m["test/angle_of_repose_standard_error_deg"], m["test/angle_of_repose_dem_standard_error_deg"]
+        )
+        rows.append(
+            row(
+                "angle of repose",
+                value("test/angle_of_repose_deg", 1.0, "degrees"),
+                f"DEM {_text(m['test/angle_of_repose_dem_deg'], 1.0)}, scatter of seeds "
+                f"{_text(scatter['angle_of_repose_deg'], 1.0)}: {off:+.1f} ± {error:.1f}",
+                "within 1 degree at 95 %",
+                abs(off) + Z_95 * error <= 1.0,
+            )
+        )
+    rows += [
+        against_dem("mean speed", "test/mean_speed_m_s", 1.0, "m/s", "within 5 %", lambda r: abs(r - 1) <= 0.05),
+        against_dem(
+            "granular temperature",
+            "test/granular_temperature_m2_s2",
+            1e4,
+            "cm²/s²",
+            "within 15 %",
+            lambda r: abs(r - 1) <= 0.15,
+        ),
+        against_dem("mean overlap", "test/mean_overlap_ratio", 100.0, "%", "at most 2 times", lambda r: r <= 2),
+        against_dem(
+            "overlap, 99.9th percentile", "test/overlap_ratio_999", 100.0, "%", "at most 1.5 times", lambda r: r <= 1.5
+        ),
+        row("grains lost", str(m["test/escaped_grains"]), "", "0", m["test/escaped_grains"] == 0),
+    ]
+    return rows
+
+
+def _condition(condition: str, m: Mapping[str, Any]) -> str:
+    center, expected = m["test/center_of_mass_error_max_m"], m["test/center_of_mass_error_climatology_max_m"]
+    angle, expected_angle = m["test/angle_of_repose_error_deg"], m["test/angle_of_repose_error_climatology_deg"]
+    better = center < expected and angle < expected_angle
+    return (
+        f"| {condition} | {_text(m['test/one_step_error_m'], 1e3)} ({_text(m['test/one_step_error_trivial_m'], 1e3)}) "
+        f"| {_text(center, 1e3)} ({_text(expected, 1e3)}) | {_text(angle, 1.0)} ({_text(expected_angle, 1.0)}) "
+        f"| {_text(m['test/mean_speed_m_s'], 1.0)} ({_text(m['test/mean_speed_m_s_dem'], 1.0)}) "
+        f"| {m['test/escaped_grains']} | {'yes' if better else '**no**'} |"
+    )
+
+
+def _text(value: Any, factor: float) -> str:
+    """Three significant digits; "-" where there is no figure."""
+    return "-" if value is None else f"{factor * value:.3g}"

@@ -1,0 +1,125 @@
+"""`make results`: judges the bundles that ship with the project and writes docs/results.json, docs/results.md and its
+pictures. Nothing in them is typed by hand."""
+
+import logging
+from collections.abc import Mapping, Sequence
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from gns_pyg import bundle, machine
+from gns_pyg.data.datamodule import EMBEDDED, find_cases, open_to_compare
+from gns_pyg.data.trajectory import Trajectory
+from gns_pyg.evaluation.baselines import Climatology
+from gns_pyg.evaluation.ensemble import curves, roll_out_ensemble
+from gns_pyg.evaluation.errors import nanmean, positions
+from gns_pyg.evaluation.judge import judge
+from gns_pyg.evaluation.metrics import Evaluation, observe, strict, write_json
+from gns_pyg.evaluation.predict import start_frame
+from gns_pyg.report.plots import draw, ensemble_spread
+from gns_pyg.report.results_page import results_page
+from gns_pyg.scene.scene import Scene
+
+BUNDLES = {  # what ships -> conditions it was never trained on
+    "hopper": ("hopper_small_fuller", "hopper_small_steeper", "hopper_small_smoother"),
+    "drum": ("drum_small_fuller", "drum_small_faster", "drum_small_smoother"),
+    "inclined_drum": (),
+}
+START_S = 0.1
+MEMBERS = 16
+PICTURES = (
+    "one_step_error",
+    "rollout_error",
+    "center_of_mass",
+    "angle_of_repose",
+    "mean_speed",
+    "granular_temperature",
+    "overlap",
+    "snapshots",
+)
+log = logging.getLogger(__name__)
+
+
+def results(docs: Path) -> dict[str, Any]:
+    """Judges every shipped bundle on the embedded cases that it has not seen and on its held-out conditions.
+
+    Args:
+        docs: folder of results.json, results.md and figures/.
+
+    Returns:
+        Scene name -> its `metrics` (the mean over unseen cases), `spread` (their standard deviation), `cases`,
+        `seed_scatter` of DEM, `ensemble` and `held_out`; what is written to results.json.
+    """
+    found: dict[str, Any] = {}
+    for name, conditions in BUNDLES.items():
+        if not (bundle.SHIPPED / name).is_dir():
+            continue
+        simulator, card = bundle.load(name), bundle.describe(name)["card"]
+        scene, expected = simulator.scene, Climatology.from_plain(card["climatology"])
+        known = {path.name: open_to_compare(path, scene) for path in find_cases(scene, str(EMBEDDED / scene.name))}
+        unseen = [known[file] for file in card["cases"]["test"]]
+        log.info("%s: %d unseen cases", name, len(unseen))
+        evaluation = judge(simulator, unseen, expected, START_S)
+        pictures(evaluation, replace(scene, frame_dt_s=unseen[0].frame_dt_s), docs / "figures", name)
+        ensemble = roll_out_ensemble(simulator, unseen[0], start_frame(unseen[0], START_S), MEMBERS)
+        title = f"{scene.name}, {unseen[0].path.stem}: {MEMBERS} roll-outs a micrometre apart"
+        ensemble_spread(ensemble, title).savefig(docs / "figures" / f"results_{name}_ensemble.png", dpi=110)
+        found[scene.name] = {
+            "bundle": name,
+            "metrics": evaluation.metrics | {"speed/device": machine.processor()},
+            "spread": spread(evaluation.per_case),
+            "cases": evaluation.per_case,
+            "trained_on": len(card["cases"]["train"]),
+            "seed_scatter": seed_scatter(list(known.values()), scene),
+            "ensemble": {key: value for key, value in ensemble.plain().items() if key != "observables"},
+            "held_out": {condition: held_out(name, condition, expected) for condition in conditions},
+        }
+        write_json(docs / "results.json", found)
+    (docs / "results.md").write_text(results_page(strict(found)), encoding="utf-8")
+    return found
+
+
+def held_out(name: str, condition: str, expected: Climatology) -> dict[str, Any]:
+    """Metrics of the bundle's networks in a scene that they were never trained on, beside the training cases' mean."""
+    log.info("held out: %s", condition)
+    paths = sorted((EMBEDDED / condition).glob("case_*.h5"))
+    scene = replace(Scene.from_config(Trajectory(paths[0]).scene), frame_dt_s=bundle.load(name).scene.frame_dt_s)
+    cases = [open_to_compare(path, scene) for path in paths]
+    return judge(bundle.load(name, scene), cases, expected, START_S).metrics
+
+
+def spread(per_case: Sequence[Mapping[str, Any]]) -> dict[str, float]:
+    """Standard deviation over cases of every figure; nan for a single case."""
+    return {
+        key: float(np.std([case[key] for case in per_case], ddof=1)) if len(per_case) > 1 else float("nan")
+        for key in per_case[0]
+        if key != "case" and all(isinstance(case[key], int | float) for case in per_case)
+    }
+
+
+def seed_scatter(cases: Sequence[Trajectory], scene: Scene) -> dict[str, float]:
+    """Standard deviation over DEM cases (other seeds) of every observable's mean over the roll-out's time; of the
+    angle of repose over its steady part."""
+    means: list[dict[str, float]] = []
+    for case in cases:
+        start = start_frame(case, START_S)
+        times_s = case.times_s[start:]
+        seen = curves(observe(positions(case, start), times_s, case.radius, case.mass, scene), scene)
+        steady = times_s >= (scene.angle_of_repose.from_s if scene.angle_of_repose else 0.0)
+        means.append({k: nanmean(c[steady] if k == "angle_of_repose_deg" else c) for k, c in seen.items()})
+    return {key: float(np.std([mean[key] for mean in means], ddof=1)) for key in means[0]}
+
+
+def pictures(evaluation: Evaluation, scene: Scene, folder: Path, name: str) -> None:
+    """Writes the figures that the page shows as results_<name>_<figure>.png."""
+    folder.mkdir(parents=True, exist_ok=True)
+    for figure_name, figure in draw(evaluation, scene).items():
+        if figure_name in PICTURES:
+            figure.savefig(folder / f"results_{name}_{figure_name}.png", dpi=90)
+
+
+if __name__ == "__main__":
+    logging.basicConfig(level=logging.INFO, format="%(message)s")
+    results(Path(__file__).parents[1] / "docs")

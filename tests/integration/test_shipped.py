@@ -1,0 +1,43 @@
+"""The bundles that ship with the project, by name."""
+
+import json
+
+import numpy as np
+import pytest
+
+from gns_pyg import bundle, run
+from gns_pyg.data.datamodule import EMBEDDED
+from gns_pyg.data.trajectory import Trajectory
+from gns_pyg.errors import BundleError, ConfigError
+from gns_pyg.evaluation.errors import position_error, positions
+from tests.integration.runs import config
+
+SHIPPED = sorted(path.name for path in bundle.SHIPPED.iterdir())
+
+
+@pytest.mark.parametrize("name", SHIPPED)
+def test_a_shipped_bundle_rolls_out_from_an_unseen_case_and_stays_near_it(name, tmp_path):
+    run.rollout(config(tmp_path, f"bundle={name}", "start_s=1.0", name="rollout"))
+    written, card = Trajectory(tmp_path / "rollout.h5"), bundle.describe(name)["card"]
+    dem = Trajectory(EMBEDDED / bundle.load(name).scene.name / written.run["start_from"])
+    assert dem.path.name in card["cases"]["test"]
+    error = position_error(positions(written)[:11], positions(dem, 100, 111))
+    assert error[-1] < 0.01, "0.1 s of it: half a radius"
+
+
+def test_an_ensemble_says_mean_spread_and_score(tmp_path):
+    scores = run.rollout(config(tmp_path, "bundle=hopper", "start_s=1.15", "ensemble=3", name="rollout"))
+    stored = json.loads((tmp_path / "ensemble.json").read_text(), parse_constant=pytest.fail)
+    assert stored["members"] == 3
+    assert len(stored["times_s"]) == 6
+    speed = stored["observables"]["mean_speed_m_s"]
+    assert np.allclose(speed["mean"], speed["dem"], rtol=0.5, atol=0.05)
+    assert scores["crps/mean_speed_m_s"] == stored["crps"]["mean_speed_m_s"] >= 0
+    assert (tmp_path / "plots" / "ensemble.png").is_file()
+
+
+def test_what_cannot_be_is_refused(tmp_path):
+    with pytest.raises(ConfigError, match="ensemble"):
+        run.rollout(config(tmp_path, "bundle=hopper", "ensemble=1", name="rollout"))
+    with pytest.raises(BundleError, match="no_such"):
+        run.rollout(config(tmp_path, "bundle=no_such", name="rollout"))
