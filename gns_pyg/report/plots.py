@@ -235,7 +235,7 @@ def ensemble_spread(ensemble: Ensemble, title: str) -> Figure:
     n_columns = 3
     n_rows = -(-len(ensemble.members) // n_columns)
     figure = _bare_figure((3.6 * n_columns, 2.5 * n_rows))
-    grid = figure.subplots(n_rows, n_columns, squeeze=False, sharex=True).flat
+    grid = list(figure.subplots(n_rows, n_columns, squeeze=False, sharex=True).flat)
     for axes, (name, members) in zip(grid, ensemble.members.items(), strict=False):
         mean, std = members.mean(axis=0), members.std(axis=0, ddof=1)
         axes.fill_between(ensemble.times_s, mean - 2 * std, mean + 2 * std, color=BLUE, alpha=0.25, linewidth=0)
@@ -244,7 +244,7 @@ def ensemble_spread(ensemble: Ensemble, title: str) -> Figure:
         axes.set_title(name, fontsize=9)
         axes.grid(color="0.88", linewidth=0.6)
         axes.spines[["top", "right"]].set_visible(False)
-    for axes in list(grid):  # places left over
+    for axes in grid[len(ensemble.members) :]:
         axes.set_visible(False)
     figure.axes[0].legend(frameon=False, fontsize=8)
     figure.supxlabel("time (s)", fontsize=10)

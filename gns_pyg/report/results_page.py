@@ -69,7 +69,7 @@ def _rows(bundle: str, m: Mapping[str, Any], spread: Mapping[str, Any], scatter:
     """Rows of what can be said of the scene."""
 
     def value(key: str, factor: float, unit: str) -> str:
-        return f"{_text(m[key], factor)} ± {_text(spread.get(key), factor)} {unit}"
+        return f"{_text(m[key], factor)} ± {_text(spread.get(key), factor, 2)} {unit}"
 
     def row(what: str, own: str, beside: str, goal: str, holds: bool) -> str:
         return f"| {what} | {own} | {beside} | {goal} | {'yes' if holds else '**no**'} |"
@@ -163,6 +163,10 @@ def _condition(condition: str, m: Mapping[str, Any]) -> str:
     )
 
 
-def _text(value: Any, factor: float) -> str:
-    """Three significant digits; "-" where there is no figure."""
-    return "-" if value is None else f"{factor * value:.3g}"
+def _text(value: Any, factor: float, digits: int = 3) -> str:
+    """So many significant digits, never an exponent; "-" where there is no figure."""
+    if value is None:
+        return "-"
+    scaled = factor * value
+    decimals = 4 if abs(scaled) < 1e-4 else max(0, digits - 1 - math.floor(math.log10(abs(scaled))))
+    return f"{scaled:.{decimals}f}"
