@@ -184,7 +184,9 @@ def build(
             flat({"model": asdict(m), "requires": asdict(r)})
             for m, r in ((config, requires), (start.config, start.requires))
         )
-        keys = [key for key in sorted({*here, *there}) if here.get(key) != there.get(key) and "reasons" not in key]
+        elsewhere = ("requires.reasons", "requires.symmetry")  # training turns windows by it, networks do not know it
+        differ = [key for key in sorted({*here, *there}) if here.get(key) != there.get(key)]
+        keys = [key for key in differ if not key.startswith(elsewhere)]
         require(
             not keys,
             "training.start_from",

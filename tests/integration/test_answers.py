@@ -141,3 +141,15 @@ def test_a_roll_out_that_diverges_is_asked_about_as_far_as_it_held(trained, monk
         assert np.isfinite(found[1].pos).all()
         with pytest.raises(ConfigError, match="train longer"):
             own_states(simulator, case, 10, 6)
+
+
+def test_training_starts_from_a_scene_of_another_symmetry(tmp_path) -> None:
+    """The inclined drum has none; what a drum's networks know of contacts holds there too."""
+    one = ["training.updates=1", "data.test_fraction=0"]
+    train(tmp_path / "drum", "experiment=drum", *one)
+    start = f"training.start_from={tmp_path / 'drum' / 'bundle'}"
+    train(tmp_path / "inclined", "experiment=inclined_drum", start, *one, "training.lr_start=1e-12")
+    drum, inclined = (bundle.load(tmp_path / name / "bundle").state_dict() for name in ("drum", "inclined"))
+    networks = [key for key in drum if not key.startswith("boundary.")]
+    assert networks
+    assert all(torch.allclose(drum[key], inclined[key], atol=1e-9) for key in networks)
