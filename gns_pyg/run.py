@@ -9,6 +9,7 @@ from importlib.metadata import version
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import pytorch_lightning as pl
 import torch
 from hydra.errors import CompactHydraException, InstantiationException
@@ -43,6 +44,7 @@ from gns_pyg.training.module import TrainingModule
 
 GROUPS = ["scene", "model", "requires", "data", "training", "trainer", "callbacks", "logger"]
 TRAIN_KEYS = ["name", "start_s", "compare_every_s", "ckpt_path", "device", "folder", *GROUPS]
+SAME_START = 1e-3  # of a radius: starts nearer than this are of one run, recorded otherwise
 log = logging.getLogger(__name__)
 
 
@@ -99,7 +101,7 @@ def train(cfg: DictConfig) -> dict[str, Any]:
     expected = climatology(cases.train, scene)
     card = {"cases": used, "training": plain(cfg.training), "climatology": asdict(expected)}
     card["coverage"] = coverage(scene, cases.train)
-    card["starts"] = [case.start_hash() for case in (*cases.train, *cases.val)]
+    card["starts"] = [case.start() for case in (*cases.train, *cases.val)]
     bundle.save(folder / "bundle", trained, strict(card))
     unseen = [open_to_compare(case.path, scene, cfg.compare_every_s) for case in cases.test]
     metrics = report(trained, unseen, expected, cfg, {"bundle": folder / "bundle"})
@@ -156,9 +158,16 @@ def unseen_cases(scene: Scene, folder: str | None, card: dict[str, Any], every_s
     """The cases of a scene (see `open_to_compare`) that a bundle was neither trained nor validated on: neither their
     content nor, however they were recorded, their start is that of one that it was."""
     seen = {digest for purpose in ("train", "val") for digest in card["cases"][purpose].values()}
-    seen |= set(card.get("starts", []))  # bundles made before have none
+    starts = [np.array(start) for start in card.get("starts", [])]  # bundles made before have none
+    within_m = SAME_START * scene.grains.radii_m[0]
+
+    def known(case: Trajectory) -> bool:
+        own = case.start()
+        same = (own.shape == start.shape and np.abs(own - start).max() < within_m for start in starts)
+        return case.content_hash() in seen or any(same)
+
     cases = [open_to_compare(path, scene, every_s) for path in find_cases(scene, folder)]
-    return [case for case in cases if not seen & {case.content_hash(), case.start_hash()}]
+    return [case for case in cases if not known(case)]
 
 
 def warn_outside(scene: Scene, case: Trajectory, start: int, card: dict[str, Any]) -> None:

@@ -14,6 +14,7 @@ from gns_pyg.data.schema import FIXED_UNITS, GRAINS, H5MD_VERSION, RUN_KEYS, UNI
 from gns_pyg.errors import DataError
 
 CHUNK_FRAMES = 8
+STARTERS = 8  # grains whose first positions tell a run
 
 
 class Trajectory:
@@ -115,11 +116,11 @@ class Trajectory:
         whole = self if self.every == 1 else Trajectory(self.path)
         return hashlib.sha256(np.ascontiguousarray(whole.read("position")).tobytes()).hexdigest()[:16]
 
-    def start_hash(self) -> str:
-        """A hash of the first frame's positions: the same run, recorded at other times or for longer, has the same."""
-        digits = self.scene["dem"]["decimals"]["position"]
-        start = np.rint(self.read("position", 0, 1) * 10**digits).astype(np.int64)
-        return hashlib.sha256(start.tobytes()).hexdigest()[:16]
+    def start(self) -> np.ndarray:
+        """What tells a run by its first frame, whenever it was recorded and however rounded: the mean position of all
+        grains and the positions of the first few, m, (1 to 9, 3)."""
+        pos = self.read("position", 0, 1)[0]
+        return np.concatenate([pos.mean(axis=0, keepdims=True), pos[:STARTERS]])
 
     def __getstate__(self) -> dict[str, Any]:
         return {**self.__dict__, "_file": None}
