@@ -1,9 +1,6 @@
 """python evaluate.py bundle=runs/.../bundle"""
 
-import hydra
-
-from gns_pyg import run
-from gns_pyg.config import CONF
+from gns_pyg import cli
 
 if __name__ == "__main__":
-    hydra.main(config_path=CONF, config_name="evaluate", version_base="1.3")(run.entry(run.evaluate))()
+    cli.evaluate()

@@ -13,7 +13,6 @@ from itertools import islice
 from pathlib import Path
 from typing import Any
 
-import hydra
 import torch
 from omegaconf import DictConfig
 from trimesh import Trimesh
@@ -22,14 +21,15 @@ from data_gen.continuation import DECIMALS
 from data_gen.dem import run_dem
 from data_gen.initial import Start
 from gns_pyg import bundle
-from gns_pyg.config import CONF, require
+from gns_pyg.config import require
 from gns_pyg.data.datamodule import open_cases
 from gns_pyg.data.trajectory import Trajectory
 from gns_pyg.dynamics.rollout import rollout
 from gns_pyg.dynamics.simulator import Simulator
 from gns_pyg.errors import NumericalError
 from gns_pyg.evaluation.predict import initial_state, start_frame
-from gns_pyg.run import entry, load_bundle
+from gns_pyg.launch import launch
+from gns_pyg.run import load_bundle
 from gns_pyg.scene.scene import Scene
 
 log = logging.getLogger(__name__)
@@ -91,4 +91,4 @@ def own_states(simulator: Simulator, case: Trajectory, start: int, every: int) -
 
 
 if __name__ == "__main__":
-    hydra.main(config_path=CONF, config_name="answers", version_base="1.3")(entry(answers))()
+    launch("answers", answers)

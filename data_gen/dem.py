@@ -16,6 +16,7 @@ from trimesh import Trimesh
 from data_gen.initial import Start
 from gns_pyg.config import plain
 from gns_pyg.errors import DataError, DependencyError
+from gns_pyg.files import clean_stale
 from gns_pyg.scene.inlet import entries
 from gns_pyg.scene.scene import Scene
 
@@ -120,11 +121,3 @@ def _follow(command: list[str], progress: Progress) -> tuple[int, list[str]]:
             process.kill()
             raise
     return process.returncode, list(tail)
-
-
-def clean_stale(path: Path) -> None:
-    """Removes unfinished files (`.NAME.PID.part`) of `path` whose process is gone."""
-    for part in path.parent.glob(f".{path.name}.*.part"):
-        pid = part.name.removesuffix(".part").rsplit(".", 1)[-1]
-        if not pid.isdigit() or not Path(f"/proc/{pid}").exists():
-            part.unlink(missing_ok=True)

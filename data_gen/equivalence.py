@@ -9,13 +9,12 @@ from itertools import combinations
 from pathlib import Path
 from typing import Any
 
-import hydra
 import numpy as np
 from omegaconf import DictConfig
 from scipy.stats import wasserstein_distance
 
 from data_gen.continuation import layout
-from gns_pyg.config import CONF, require
+from gns_pyg.config import require
 from gns_pyg.data.datamodule import open_cases
 from gns_pyg.data.trajectory import Trajectory
 from gns_pyg.evaluation.errors import nanmean, positions
@@ -23,7 +22,7 @@ from gns_pyg.evaluation.flow import discharge_rate
 from gns_pyg.evaluation.metrics import observe, write_json
 from gns_pyg.evaluation.observables import finite_difference_velocity, from_frame, time_mean
 from gns_pyg.evaluation.predict import start_frame
-from gns_pyg.run import entry
+from gns_pyg.launch import launch
 from gns_pyg.scene.scene import Scene
 
 log = logging.getLogger(__name__)
@@ -119,4 +118,4 @@ def table(result: dict[str, Any]) -> str:
 
 
 if __name__ == "__main__":
-    hydra.main(config_path=CONF, config_name="equivalence", version_base="1.3")(entry(equivalence))()
+    launch("equivalence", equivalence)

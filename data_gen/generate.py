@@ -8,9 +8,7 @@ import time
 from collections.abc import Mapping
 from pathlib import Path
 
-import hydra
 from hydra.core.hydra_config import HydraConfig
-from hydra.errors import CompactHydraException
 from hydra.types import RunMode
 from omegaconf import DictConfig
 from tqdm import tqdm
@@ -18,9 +16,10 @@ from trimesh import Trimesh
 
 from data_gen.dem import run_dem
 from data_gen.initial import initial_state
-from gns_pyg.config import CONF, flat, plain, require
+from gns_pyg.config import flat, plain, require
 from gns_pyg.data.trajectory import Trajectory
-from gns_pyg.errors import DataError, GnsError
+from gns_pyg.errors import DataError
+from gns_pyg.launch import launch
 from gns_pyg.scene.mesh import build_mesh, same_mesh
 from gns_pyg.scene.scene import Scene
 
@@ -108,14 +107,9 @@ def say(text: str) -> None:
     print(text, flush=True)
 
 
-@hydra.main(config_path=CONF, config_name="generate", version_base="1.3")
-def main(config: DictConfig) -> None:
-    try:
-        generate(config)
-    except GnsError as error:  # Hydra prints a compact exception without a traceback and exits with status 1
-        raise CompactHydraException(str(error)) from None
-    except KeyboardInterrupt:
-        sys.exit("interrupted: the unfinished case was removed, finished ones stay")
+def main() -> None:
+    """gns-generate"""
+    launch("generate", generate)
 
 
 if __name__ == "__main__":

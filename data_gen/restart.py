@@ -18,18 +18,17 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
-import hydra
 import numpy as np
 from omegaconf import DictConfig, OmegaConf
 
 from data_gen.continuation import continue_dem, frame_at, layout, open_case, stored_state
 from data_gen.initial import Start
-from gns_pyg.config import CONF, require
+from gns_pyg.config import require
 from gns_pyg.data.trajectory import Trajectory
 from gns_pyg.evaluation.baselines import FIRST_FRAME, trivial_errors
 from gns_pyg.evaluation.errors import position_error, positions
 from gns_pyg.evaluation.metrics import write_json
-from gns_pyg.run import entry
+from gns_pyg.launch import launch
 
 log = logging.getLogger(__name__)
 
@@ -114,4 +113,4 @@ def _means(errors: dict[str, list[float]]) -> dict[str, float]:
 
 
 if __name__ == "__main__":
-    hydra.main(config_path=CONF, config_name="restart", version_base="1.3")(entry(restart))()
+    launch("restart", restart)

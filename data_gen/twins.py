@@ -11,16 +11,15 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
-import hydra
 import numpy as np
 from omegaconf import DictConfig
 
 from data_gen.continuation import continue_dem, frame_at, layout, open_case, stored_state
-from gns_pyg.config import CONF, require
+from gns_pyg.config import require
 from gns_pyg.evaluation.errors import position_error, positions
 from gns_pyg.evaluation.metrics import write_json
 from gns_pyg.evaluation.twins import twins_path
-from gns_pyg.run import entry
+from gns_pyg.launch import launch
 
 log = logging.getLogger(__name__)
 
@@ -63,6 +62,7 @@ def twins(cfg: DictConfig) -> dict[str, Any]:
     result = {
         "scene": scene.name,
         "case": trajectory.path.stem,
+        "content_hash": trajectory.content_hash(),
         "start_s": float(trajectory.times_s[frame]),
         "perturbation_m": sigma,
         "times_s": trajectory.times_s[frame:],
@@ -86,4 +86,4 @@ def table(result: dict[str, Any]) -> str:
 
 
 if __name__ == "__main__":
-    hydra.main(config_path=CONF, config_name="twins", version_base="1.3")(entry(twins))()
+    launch("twins", twins)

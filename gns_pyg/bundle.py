@@ -1,27 +1,28 @@
 """A trained simulator as one folder: weights.safetensors and bundle.json. Data only, nothing executable."""
 
 import json
-import os
-import shutil
 from collections.abc import Mapping
 from dataclasses import asdict, replace
 from pathlib import Path
 from typing import Any
 
+import torch
 from safetensors import SafetensorError
 from safetensors.torch import load_file, save_file
-from torch import nn
+from torch import Tensor, nn
 
 from gns_pyg.config import typed
 from gns_pyg.dynamics.model_config import ModelConfig
 from gns_pyg.dynamics.simulator import Simulator
 from gns_pyg.errors import BundleError
+from gns_pyg.files import whole
 from gns_pyg.models.statistics import Statistics
 from gns_pyg.scene.boundary_points import BoundaryPoints, boundary_points
 from gns_pyg.scene.requirements import Requirements, check_covers
 from gns_pyg.scene.scene import Scene
 
 FORMAT_VERSION = 2
+REMEDY = "copy the bundle again, or train again"
 SHIPPED = Path(__file__).parent / "bundles"
 
 
@@ -38,13 +39,12 @@ def save(folder: str | Path, simulator: Simulator, card: Mapping[str, Any]) -> P
         folder: where the bundle goes.
         simulator: the trained simulator.
         card: what it was trained on and how good it is (plain values).
+
+    Raises:
+        StorageError: if it cannot be written; the old one stays.
     """
     folder = Path(folder)
-    temporary = folder.with_name(f".{folder.name}.{os.getpid()}.part")
-    shutil.rmtree(temporary, ignore_errors=True)
-    temporary.mkdir(parents=True)
     weights = {key: value.detach().cpu().contiguous() for key, value in simulator.state_dict().items()}
-    save_file(weights, temporary / "weights.safetensors")
     description = {
         "format_version": FORMAT_VERSION,
         "scene": asdict(simulator.scene),
@@ -53,9 +53,13 @@ def save(folder: str | Path, simulator: Simulator, card: Mapping[str, Any]) -> P
         "statistics": asdict(simulator.statistics),
         "card": dict(card),
     }
-    (temporary / "bundle.json").write_text(json.dumps(description, indent=1))
-    shutil.rmtree(folder, ignore_errors=True)
-    os.replace(temporary, folder)
+    with whole(folder) as temporary:
+        temporary.mkdir()
+        try:
+            save_file(weights, temporary / "weights.safetensors")
+        except SafetensorError as error:  # an OSError in its clothes
+            raise OSError(str(error)) from None
+        (temporary / "bundle.json").write_text(json.dumps(description, indent=1))
     return folder
 
 
@@ -68,7 +72,7 @@ def describe(folder: str | Path) -> dict[str, Any]:
     path = find(folder) / "bundle.json"
     try:
         description = json.loads(path.read_text())
-    except (OSError, ValueError) as error:
+    except (OSError, ValueError, RecursionError) as error:
         raise BundleError(path, str(error), "a bundle folder written by train.py", "check bundle=PATH") from None
     version = description.get("format_version") if isinstance(description, dict) else None
     if version != FORMAT_VERSION:
@@ -100,11 +104,9 @@ def load(folder: str | Path, scene: Scene | None = None) -> Simulator:
     path = folder / "weights.safetensors"
     try:
         weights = load_file(path)
+        _check_weights(path, weights, model)
         if scene is None:
-            points = {
-                name: BoundaryPoints(*(weights[f"boundary.parts.{part}.{key}"].numpy() for key in ("pos", "normal")))
-                for part, name in enumerate(own.boundary)
-            }
+            points = {name: _points(path, weights, part) for part, name in enumerate(own.boundary)}
         else:
             check_covers(requires, scene)
             requires = replace(requires, active_mask=scene.outlet is not None or scene.inlet is not None)
@@ -116,7 +118,25 @@ def load(folder: str | Path, scene: Scene | None = None) -> Simulator:
             weights |= {f"boundary.{k}": v for k, v in (simulator.boundary or nn.Module()).state_dict().items()}
         simulator.load_state_dict(weights)
     except (OSError, SafetensorError, KeyError, RuntimeError) as error:
-        raise BundleError(
-            path, str(error), "the weights of the model in bundle.json", "copy the bundle again, or train again"
-        ) from None
+        raise BundleError(path, str(error), "the weights of the model in bundle.json", REMEDY) from None
     return simulator.eval()
+
+
+def _check_weights(path: Path, weights: Mapping[str, Tensor], model: ModelConfig) -> None:
+    """Refuses values that are not finite, and a model whose networks are larger than all that is stored: building it
+    first would take the memory that it claims."""
+    for name, tensor in weights.items():
+        if not (tensor.is_floating_point() and torch.isfinite(tensor).all()):
+            raise BundleError(path, f"{name}: {tensor.dtype}, or not finite", "finite floating-point values", REMEDY)
+    stored = sum(tensor.numel() for name, tensor in weights.items() if not name.startswith("boundary."))
+    claimed = model.hidden**2 * model.layers * model.mlp_layers
+    if claimed > stored:
+        raise BundleError(path, f"{stored} weights", f"at least {claimed}, for the model in bundle.json", REMEDY)
+
+
+def _points(path: Path, weights: Mapping[str, Tensor], part: int) -> BoundaryPoints:
+    pos, normal = (weights[f"boundary.parts.{part}.{key}"] for key in ("pos", "normal"))
+    if pos.ndim != 2 or pos.shape[1] != 3 or pos.shape != normal.shape or not len(pos):
+        found = f"boundary points {tuple(pos.shape)} with normals {tuple(normal.shape)}"
+        raise BundleError(path, found, "(n, 3) of each", REMEDY)
+    return BoundaryPoints(pos.numpy(), normal.numpy())

@@ -31,7 +31,7 @@ def typed(record: type[Record], values: Any, where: str) -> Record:
     try:
         merged = OmegaConf.merge(OmegaConf.structured(record), values)
         return cast(Record, OmegaConf.to_object(merged))
-    except OmegaConfBaseException as error:
+    except (OmegaConfBaseException, OverflowError) as error:  # the latter: a whole number too large for a float
         key = getattr(error, "full_key", None)
         reason = str(error).splitlines()[0]
         known = ", ".join(field.name for field in fields(record))  # type: ignore[arg-type]

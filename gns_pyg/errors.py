@@ -38,6 +38,14 @@ class BundleError(GnsError):
     """A trained bundle that cannot be loaded."""
 
 
+class CheckpointError(GnsError):
+    """A checkpoint that cannot be read or resumed from."""
+
+
+class StorageError(GnsError):
+    """A file that cannot be written: no room, no permission."""
+
+
 class NumericalError(GnsError):
     """A value that is not finite, or a limit that was reached while computing."""
 

@@ -1,10 +1,9 @@
 """What the entry points call: each takes the composed config and returns its metrics."""
 
+import itertools
 import logging
 import warnings
-from collections.abc import Callable
 from dataclasses import asdict, replace
-from functools import wraps
 from importlib.metadata import version
 from pathlib import Path
 from typing import Any
@@ -12,10 +11,11 @@ from typing import Any
 import numpy as np
 import pytorch_lightning as pl
 import torch
-from hydra.errors import CompactHydraException, InstantiationException
+from hydra.errors import InstantiationException
 from hydra.utils import instantiate
 from omegaconf import DictConfig, OmegaConf
 from pytorch_lightning.utilities.exceptions import MisconfigurationException
+from pytorch_lightning.utilities.rank_zero import rank_zero_only
 
 from gns_pyg import bundle, machine
 from gns_pyg.config import check_keys, flat, plain, require, typed
@@ -27,7 +27,7 @@ from gns_pyg.dynamics.execution import Execution
 from gns_pyg.dynamics.integrator import Integrator
 from gns_pyg.dynamics.model_config import ModelConfig
 from gns_pyg.dynamics.simulator import Simulator
-from gns_pyg.errors import ConfigError, GnsError
+from gns_pyg.errors import CheckpointError, ConfigError, GnsError
 from gns_pyg.evaluation.baselines import Climatology, climatology
 from gns_pyg.evaluation.ensemble import roll_out_ensemble
 from gns_pyg.evaluation.judge import judge
@@ -39,6 +39,8 @@ from gns_pyg.report.table import ensemble_table, metrics_table
 from gns_pyg.scene.boundary_points import boundary_points
 from gns_pyg.scene.requirements import Requirements, Requires, resolve
 from gns_pyg.scene.scene import Scene
+from gns_pyg.training import checkpoint
+from gns_pyg.training.checkpoint import Checkpoints
 from gns_pyg.training.config import TrainingConfig
 from gns_pyg.training.module import TrainingModule
 
@@ -50,6 +52,9 @@ log = logging.getLogger(__name__)
 
 def train(cfg: DictConfig) -> dict[str, Any]:
     """Trains a simulator on a scene's cases, judges it on the unseen ones and saves it as a bundle.
+
+    In a run folder that holds a checkpoint already, training goes on from it: the command that was killed, given again
+    with the same run folder, ends as if it had not been.
 
     Returns:
         The metrics that are also written to metrics.json in the run folder.
@@ -94,9 +99,16 @@ def train(cfg: DictConfig) -> dict[str, Any]:
     identity["scene.seed"] = scene.seed  # of the boundary points
     del identity["training.updates"]  # a run may be lengthened
     module = TrainingModule(simulator, training, identity)
+    resume_from = cfg.ckpt_path
+    if resume_from is None and (last := folder / "checkpoints" / "last.ckpt").is_file():
+        log.info("going on from %s", last)
+        resume_from = str(last)
+    set_log_aside(folder)
     trainer = build_trainer(cfg, training, where)
-    fit(trainer, module, datamodule, cfg.ckpt_path)
+    fit(trainer, module, datamodule, resume_from)
     trainer.save_checkpoint(folder / "checkpoints" / "last.ckpt")
+    if not trainer.is_global_zero:  # the first process judges and writes
+        return {}
     trained = module.judged.eval().to(where)
     expected = climatology(cases.train, scene)
     card = {"cases": used, "training": plain(cfg.training), "climatology": asdict(expected)}
@@ -235,6 +247,8 @@ def build_trainer(cfg: DictConfig, training: TrainingConfig, where: torch.device
             logger=instantiate(cfg.logger),
             callbacks=[instantiate(callback) for callback in cfg.callbacks.values() if callback is not None],
             default_root_dir=cfg.folder,
+            plugins=[Checkpoints()],
+            use_distributed_sampler=False,  # UpdateSampler divides batches itself
             enable_progress_bar=False,
             enable_model_summary=False,
             log_every_n_steps=50,
@@ -254,11 +268,32 @@ def build_trainer(cfg: DictConfig, training: TrainingConfig, where: torch.device
 
 
 def fit(trainer: pl.Trainer, module: TrainingModule, datamodule: DataModule, ckpt_path: str | None) -> None:
-    """Trains, from `ckpt_path` on where it is given."""
+    """Trains, from `ckpt_path` on where it is given.
+
+    Raises:
+        ConfigError: if there is no such checkpoint, or it is of another config or other data.
+        CheckpointError: if it is damaged.
+    """
     if ckpt_path is not None:
         known = "a checkpoint of this model, e.g. runs/.../checkpoints/last.ckpt"
         require(Path(ckpt_path).is_file(), "ckpt_path", f"{ckpt_path}: no such file", known, "correct the path")
-    trainer.fit(module, datamodule, ckpt_path=ckpt_path, weights_only=True)
+    try:
+        trainer.fit(module, datamodule, ckpt_path=ckpt_path, weights_only=True)
+    except (GnsError, OSError):
+        raise
+    except Exception as error:  # whatever else Lightning trips over before the first update is in the checkpoint
+        if ckpt_path is None or module.started:
+            raise
+        found = f"{type(error).__name__}: {error}"
+        raise CheckpointError(ckpt_path, found, "a checkpoint written by train.py", checkpoint.REMEDY) from None
+
+
+@rank_zero_only
+def set_log_aside(folder: Path) -> None:
+    """Renames the log of an earlier start in this folder to log_0, log_1, ...: Lightning would delete its rows."""
+    if (folder / "log").is_dir():
+        number = next(n for n in itertools.count() if not (folder / f"log_{n}").exists())
+        (folder / "log").rename(folder / f"log_{number}")
 
 
 def load_bundle(cfg: DictConfig) -> Simulator:
@@ -319,16 +354,3 @@ def versions(case: Trajectory) -> dict[str, str]:
     """Programs that had a part in the result."""
     packages = ("gns_pyg", "torch", "torch_geometric", "pytorch_lightning", "numpy", "scipy")
     return {name: version(name) for name in packages} | {case.run["creator"]: case.run["creator_version"]}
-
-
-def entry(function: Callable[[DictConfig], dict[str, Any]]) -> Callable[[DictConfig], dict[str, Any]]:
-    """Makes an entry point end with a message and status 1, no traceback, on an error that a user can act on."""
-
-    @wraps(function)
-    def run(cfg: DictConfig) -> dict[str, Any]:
-        try:
-            return function(cfg)
-        except GnsError as error:
-            raise CompactHydraException(f"{type(error).__name__}: {error}") from None  # printed without a traceback
-
-    return run

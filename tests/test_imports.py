@@ -7,8 +7,8 @@ from pathlib import Path
 import pytest
 
 PACKAGE = Path(__file__).parents[1] / "gns_pyg"
-GROUND = {"errors", "config", "state", "machine"}
-BELOW = {"errors": set(), "machine": set(), "config": {"errors"}, "state": {"errors"}}
+GROUND = {"errors", "config", "state", "machine", "files"}
+BELOW = {"errors": set(), "machine": set(), "config": {"errors"}, "state": {"errors"}, "files": {"errors"}}
 BELOW |= {room: {room} | GROUND for room in ("models", "scene", "graph")}
 BELOW["dynamics"] = {"dynamics", "models", "scene", "graph"} | GROUND
 BELOW["data"] = {"data"} | BELOW["dynamics"]
@@ -18,7 +18,9 @@ BELOW["training"] = {"training"} | BELOW["evaluation"]
 BELOW["report"] = {"report"} | BELOW["evaluation"]
 BELOW["results"] = {"results"} | BELOW["report"]
 BELOW["run"] = {*BELOW, "run"}
-IN_YADE = {"data/schema.py": {"errors"}, "data/trajectory.py": {"errors", "data"}, "scene/travel.py": set()}
+BELOW["launch"] = {"config", "errors", "files"}
+BELOW["cli"] = {"run", "launch"}
+IN_YADE = {"data/schema.py": {"errors"}, "data/trajectory.py": {"errors", "data", "files"}, "scene/travel.py": set()}
 FILES = sorted(path for path in PACKAGE.rglob("*.py") if "conf" not in path.relative_to(PACKAGE).parts)
 
 

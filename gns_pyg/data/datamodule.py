@@ -137,9 +137,10 @@ def split(scene: Scene, config: DataConfig) -> Split:
     """Opens, checks and splits the cases of a scene.
 
     Raises:
-        DataError: if a case cannot be used (see `open_case`), or if too few are left to train on.
+        DataError: if a case cannot be used (see `open_case`) or is there twice, or if too few are left to train on.
     """
     trajectories = open_cases(scene, config.dir)
+    check_all_differ(trajectories)
     n_test = math.ceil(config.test_fraction * len(trajectories))
     n_train = len(trajectories) - n_test - config.val_cases
     if n_train < 1:
@@ -156,6 +157,20 @@ def split(scene: Scene, config: DataConfig) -> Split:
         trajectories[-n_test:] if n_test else [],
         [file for folder in config.answers for file in open_answers(Path(folder), scene, train)],
     )
+
+
+def check_all_differ(trajectories: Sequence[Trajectory]) -> None:
+    """Checks that no run is there twice, so that none can serve two purposes.
+
+    Raises:
+        DataError: if two files hold the same positions; names both.
+    """
+    first: dict[str, Path] = {}
+    for case in trajectories:
+        twin = first.setdefault(case.content_hash(), case.path)
+        if twin is not case.path:
+            remedy = "delete one of them, or generate it with another case number"
+            raise DataError(case.path, f"the same run as {twin.name}", "every run once", remedy)
 
 
 def open_answers(folder: Path, scene: Scene, train: Sequence[Trajectory]) -> list[Trajectory]:
@@ -274,7 +289,7 @@ class DataModule(pl.LightningDataModule):
     Args:
         cases: the split.
         length: frames of a window.
-        batch_size: windows per update.
+        batch_size: windows per update, over all processes.
         seed: of the shuffling.
         workers: data-loading processes.
     """
@@ -287,10 +302,12 @@ class DataModule(pl.LightningDataModule):
         self.windows: ConcatDataset = ConcatDataset([recorded, *[answers] * times])
 
     def train_dataloader(self) -> DataLoader:
-        done = self.trainer.global_step if self.trainer else 0
+        done, process, processes = 0, 0, 1
+        if self.trainer:
+            done, process, processes = self.trainer.global_step, self.trainer.global_rank, self.trainer.world_size
         return DataLoader(
             self.windows,
-            batch_sampler=UpdateSampler(len(self.windows), self.batch_size, self.seed, done),
+            batch_sampler=UpdateSampler(len(self.windows), self.batch_size, self.seed, done, process, processes),
             collate_fn=_collate,
             num_workers=self.workers,
         )

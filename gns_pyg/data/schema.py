@@ -1,6 +1,7 @@
 """The trajectory file's layout (H5MD 1.1): keys, units and what a valid file must hold. numpy and h5py only."""
 
 import json
+import math
 
 import h5py
 import numpy as np
@@ -11,15 +12,19 @@ UNITS = {"position": "m", "velocity": "m s-1", "angular_velocity": "rad s-1"}
 FIXED_UNITS = {"radius": "m", "mass": "kg"}
 OPTIONAL = {"gns_pyg": {"angular_velocity"}}  # by creator: a model's state need not hold rotation; DEM's does
 NUMBERS = "fiu"  # numpy's kinds of real numbers
+BLOCK_BYTES = 2**24  # of a field that is checked at once
+MOST_PACKED = 1000  # a data set may be this many times as large as the file that holds it; gzip packs 1032 to 1
 RUN_KEYS = ("wall_clock_s", "cores", "steps", "dt_s", "creator", "creator_version")
 
 
 def violations(file: h5py.File) -> list[str]:
     """Lists everything in `file` that breaks the layout; an empty list is a valid file.
 
-    Fields are checked for finite values frame block by frame block, so memory stays bounded.
+    Nothing is read before all links and sizes are known to be sound, and fields are checked for finite values block by
+    block, so memory stays bounded by the file's size, whatever sizes it claims.
     """
-    wrong: list[str] = []
+    if wrong := _foreign(file):
+        return wrong
     header, parameters = file.get("h5md"), file.get("parameters")
     if not isinstance(header, h5py.Group) or "version" not in header.attrs:
         wrong.append("/h5md: attribute `version` missing; expected an H5MD 1.x file")
@@ -38,6 +43,25 @@ def violations(file: h5py.File) -> list[str]:
     if not isinstance(boundary, h5py.Group) and "boundary" in file:
         return [*wrong, "/boundary: a data set, expected a group"]
     return wrong + [text for name in boundary for text in _wrong_part(file, f"boundary/{name}")]
+
+
+def _foreign(file: h5py.File) -> list[str]:
+    """What leads out of the file, or claims to be far larger than the file could hold."""
+    wrong: list[str] = []
+    stored = file.id.get_filesize()
+
+    def look(name: str, link: object) -> None:
+        if isinstance(link, h5py.ExternalLink):
+            wrong.append(f"/{name}: a link to another file")
+        elif isinstance(link, h5py.HardLink) and isinstance(found := file[name], h5py.Dataset):
+            if found.is_virtual or found.external:
+                wrong.append(f"/{name}: its values lie in another file")
+            for what, shape in (("values", found.shape or ()), ("a chunk", found.chunks or ())):
+                if (claimed := math.prod(shape) * found.dtype.itemsize) > MOST_PACKED * stored:
+                    wrong.append(f"/{name}: {what} of {claimed / 1e6:.3g} MB in a file of {stored / 1e6:.3g} MB")
+
+    file.visititems_links(look)
+    return wrong
 
 
 def _wrong_grains(grains: h5py.Group, creator: str) -> list[str]:
@@ -94,6 +118,8 @@ def _wrong_part(file: h5py.File, path: str) -> list[str]:
             wrong.append(f"{data.name}: {data.dtype} {data.shape}, expected {expected}")
     if wrong or vertices is None or triangles is None:
         return wrong
+    if not np.isfinite(vertices[:]).all():
+        wrong.append(f"{vertices.name}: not all finite")
     if not ((triangles[:] >= 0) & (triangles[:] < len(vertices))).all():
         wrong.append(f"{triangles.name}: not all are rows of vertices (0 to {len(vertices) - 1})")
     return wrong
@@ -121,7 +147,7 @@ def _not_json(group: h5py.Group, name: str) -> list[str]:
 
 
 def _not_finite(value: h5py.Dataset, where: str) -> list[str]:
-    block = 64
+    block = max(1, BLOCK_BYTES // max(1, math.prod(value.shape[1:]) * value.dtype.itemsize))
     for start in range(0, value.shape[0], block):
         bad = ~np.isfinite(value[start : start + block])
         if bad.any():

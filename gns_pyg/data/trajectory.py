@@ -4,6 +4,7 @@ import hashlib
 import json
 import os
 from collections.abc import Mapping
+from contextlib import suppress
 from pathlib import Path
 from typing import Any
 
@@ -11,7 +12,8 @@ import h5py
 import numpy as np
 
 from gns_pyg.data.schema import FIXED_UNITS, GRAINS, H5MD_VERSION, RUN_KEYS, UNITS, violations
-from gns_pyg.errors import DataError
+from gns_pyg.errors import DataError, StorageError
+from gns_pyg.files import REMEDY, remove, unfinished
 
 CHUNK_FRAMES = 8
 STARTERS = 8  # grains whose first positions tell a run
@@ -47,7 +49,7 @@ class Trajectory:
                 wrong = violations(file)
                 if not wrong:
                     self._read_fixed(file)
-        except (OSError, RuntimeError, KeyError, ValueError) as error:
+        except Exception as error:  # h5py has all kinds for damaged bytes, SystemError and UnicodeError among them
             wrong = [f"cannot be read as HDF5 ({error})"]
         if wrong:
             raise DataError(
@@ -57,6 +59,7 @@ class Trajectory:
                 "delete the file and generate it again, or correct what is listed",
             )
         self._file: h5py.File | None = None
+        self._hash: str | None = None
 
     def _read_fixed(self, file: h5py.File) -> None:
         grains = file[GRAINS]
@@ -113,8 +116,10 @@ class Trajectory:
     def content_hash(self) -> str:
         """A hash of all stored positions: the same run has the same hash whatever its file is called, however many of
         its frames are read."""
-        whole = self if self.every == 1 else Trajectory(self.path)
-        return hashlib.sha256(np.ascontiguousarray(whole.read("position")).tobytes()).hexdigest()[:16]
+        if self._hash is None:
+            whole = self if self.every == 1 else Trajectory(self.path)
+            self._hash = hashlib.sha256(np.ascontiguousarray(whole.read("position")).tobytes()).hexdigest()[:16]
+        return self._hash
 
     def start(self) -> np.ndarray:
         """What tells a run by its first frame, whenever it was recorded and however rounded: the mean position of all
@@ -139,6 +144,9 @@ class TrajectoryWriter:
         decimals: digits kept after the point (HDF5's scale-offset filter, SI units) of every field to be written:
             all three for a DEM run; a model whose state has no rotation leaves `angular_velocity` out.
         with_active: grains leave or enter, so that every frame says which ones are there.
+
+    Raises:
+        StorageError: from every method, if the file cannot be written.
     """
 
     def __init__(
@@ -152,9 +160,24 @@ class TrajectoryWriter:
         with_active: bool = False,
     ) -> None:
         self.path = Path(path)
-        self.path.parent.mkdir(parents=True, exist_ok=True)
-        self._temporary = self.path.with_name(f".{self.path.name}.{os.getpid()}.part")
-        self._file = h5py.File(self._temporary, "w")
+        self._temporary = unfinished(self.path)
+        try:
+            self.path.parent.mkdir(parents=True, exist_ok=True)
+            self._file = h5py.File(self._temporary, "w")
+            self._create(scene, radius, mass, boundary, decimals, with_active)
+        except (OSError, RuntimeError) as error:
+            self.__exit__()
+            raise self._not_written(error) from None
+
+    def _create(
+        self,
+        scene: Mapping[str, Any],
+        radius: np.ndarray,
+        mass: np.ndarray,
+        boundary: Mapping[str, Mapping[str, Any]],
+        decimals: Mapping[str, int],
+        with_active: bool,
+    ) -> None:
         self._n_frames, self._n_grains = 0, len(radius)
         header = self._file.create_group("h5md")
         header.attrs["version"] = H5MD_VERSION
@@ -247,7 +270,11 @@ class TrajectoryWriter:
             grains["position"][name][self._n_frames] = value
         self._n_frames += 1
         if len(self._pending["position"]) == CHUNK_FRAMES:  # a whole chunk at once: each is compressed once
-            self._flush()
+            try:
+                self._flush()
+                self._file.flush()
+            except (OSError, RuntimeError) as error:
+                raise self._not_written(error) from None
 
     def _flush(self) -> None:
         for name, frames in self._pending.items():
@@ -262,17 +289,25 @@ class TrajectoryWriter:
         missing = [key for key in RUN_KEYS if key not in run]
         if missing:
             raise DataError(self.path, f"run facts without {missing}", f"all of {RUN_KEYS}", "pass them to finish()")
-        self._flush()
-        self._file["parameters"].attrs.update(run)
-        creator = self._file["h5md"].create_group("creator")
-        creator.attrs["name"], creator.attrs["version"] = run["creator"], run["creator_version"]
-        self._file.close()
-        os.replace(self._temporary, self.path)
+        try:
+            self._flush()
+            self._file["parameters"].attrs.update(run)
+            creator = self._file["h5md"].create_group("creator")
+            creator.attrs["name"], creator.attrs["version"] = run["creator"], run["creator_version"]
+            self._file.close()
+            os.replace(self._temporary, self.path)
+        except (OSError, RuntimeError) as error:
+            raise self._not_written(error) from None
+
+    def _not_written(self, error: Exception) -> StorageError:
+        return StorageError(self.path, " ".join(str(error).split()), "a folder that can be written to", REMEDY)
 
     def __enter__(self) -> "TrajectoryWriter":
         return self
 
     def __exit__(self, *_: object) -> None:
-        if self._file:
+        with suppress(
+            AttributeError, OSError, RuntimeError
+        ):  # never opened; or what is in memory finds no room: given up
             self._file.close()
-        self._temporary.unlink(missing_ok=True)
+        remove(self._temporary)

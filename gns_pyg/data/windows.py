@@ -7,6 +7,7 @@ import numpy as np
 import torch
 from torch.utils.data import Dataset, Sampler
 
+from gns_pyg.config import require
 from gns_pyg.data.trajectory import Trajectory
 from gns_pyg.errors import DataError
 from gns_pyg.scene.scene import PARAMETERS
@@ -89,10 +90,28 @@ class Answers(Dataset):
 
 class UpdateSampler(Sampler):
     """Endless batches of shuffled items; batch number `update` is a function of the seed alone, so a resumed run
-    goes on exactly where it stopped."""
+    goes on exactly where it stopped, and there is no last, smaller batch: an epoch's last items share their batch with
+    the next one's first.
 
-    def __init__(self, n_items: int, batch_size: int, seed: int, first_update: int = 0) -> None:
+    Args:
+        n_items: how many there are.
+        batch_size: items of an update, over all processes.
+        seed: of the shuffling.
+        first_update: where to begin.
+        process, processes: which of how many this is; each takes an equal part of every batch.
+
+    Raises:
+        ConfigError: if a batch cannot be divided among the processes.
+    """
+
+    def __init__(
+        self, n_items: int, batch_size: int, seed: int, first_update: int = 0, process: int = 0, processes: int = 1
+    ) -> None:
         self.n_items, self.batch_size, self.seed, self.first_update = n_items, batch_size, seed, first_update
+        expected = f"a multiple of the {processes} processes (trainer.devices, trainer.num_nodes)"
+        require(batch_size % processes == 0, "training.batch_size", batch_size, expected, f"e.g. {processes}")
+        share = batch_size // processes
+        self.part = slice(process * share, (process + 1) * share)
 
     def __iter__(self) -> Iterator[list[int]]:
         position, order, epoch = self.first_update * self.batch_size, np.empty(0, int), -1
@@ -104,4 +123,4 @@ class UpdateSampler(Sampler):
                     order = np.random.default_rng((self.seed, epoch)).permutation(self.n_items)
                 batch.append(int(order[place % self.n_items]))
             position += self.batch_size
-            yield batch
+            yield batch[self.part]

@@ -1,6 +1,6 @@
 """A scene in pieces that are computed one after the other, so that memory follows the piece and not the scene."""
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 
 import torch
 from jaxtyping import Float, Int
@@ -36,7 +36,11 @@ def tiles(
 
 
 def ball(
-    pos: Float[Tensor, "n_grains 3"], batch: Int[Tensor, " n_grains"], most: int, halo_m: float, random: torch.Generator
+    pos: Float[Tensor, "n_grains 3"],
+    batch: Int[Tensor, " n_grains"],
+    most: int,
+    halo_m: float,
+    randoms: Sequence[torch.Generator],
 ) -> tuple[Int[Tensor, " n_core"], Int[Tensor, " n_region"]]:
     """The `most` grains nearest to a random one, in every graph.
 
@@ -45,7 +49,7 @@ def ball(
         batch: graph of each grain, sorted.
         most: grains of a graph that are taken, at least 1.
         halo_m: width of the margin around them.
-        random: draws the centres.
+        randoms: draw the centres, one for each graph.
 
     Returns:
         The grains taken, and, sorted, those with the margin.
@@ -53,7 +57,7 @@ def ball(
     cores, regions = [batch.new_empty(0)], [batch.new_empty(0)]
     for graph in batch.unique():
         grains = (batch == graph).nonzero().flatten()
-        centre = pos[grains[torch.randint(len(grains), (), generator=random)]]
+        centre = pos[grains[torch.randint(len(grains), (), generator=randoms[int(graph)])]]
         distance = torch.linalg.vector_norm(pos[grains] - centre, dim=1)
         radius = distance.kthvalue(min(most, len(grains))).values
         cores.append(grains[distance <= radius])

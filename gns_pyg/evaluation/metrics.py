@@ -2,7 +2,6 @@
 
 import json
 import math
-import os
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -27,6 +26,7 @@ from gns_pyg.evaluation.observables import (
     time_mean,
 )
 from gns_pyg.evaluation.twins import Twins, horizon, read_twins
+from gns_pyg.files import whole
 from gns_pyg.scene.scene import Scene
 
 LATE_S = 1.0  # from here on a roll-out's error is compared with the twins'
@@ -367,11 +367,8 @@ def _largest_distance(curve: np.ndarray, truth: np.ndarray) -> float:
 
 def write_json(path: str | Path, metrics: Any) -> None:
     """Writes strict JSON (nan and infinity become null) under a temporary name, then renames it to `path`."""
-    path = Path(path)
-    path.parent.mkdir(parents=True, exist_ok=True)
-    temporary = path.with_name(f".{path.name}.{os.getpid()}.part")
-    temporary.write_text(json.dumps(strict(metrics), indent=2, allow_nan=False) + "\n", encoding="utf-8")
-    os.replace(temporary, path)
+    with whole(path) as temporary:
+        temporary.write_text(json.dumps(strict(metrics), indent=2, allow_nan=False) + "\n", encoding="utf-8")
 
 
 def strict(value: Any) -> Any:

@@ -33,20 +33,23 @@ def read_twins(case: Trajectory, times_s: np.ndarray) -> Twins | None:
     where there are none, or they start at another time.
 
     Raises:
-        DataError: if the file cannot be read.
+        DataError: if the file cannot be read, or belongs to another run.
     """
     path = twins_path(case.path)
     if not path.is_file():
         return None
+    remedy = "delete it, or make it again: python -m data_gen.twins"
     try:
         stored = json.loads(path.read_text())
+        if stored["content_hash"] != case.content_hash():
+            found, expected = f"twins of the run {stored['content_hash']}", f"twins of the run {case.content_hash()}"
+            raise DataError(path, found, expected, remedy)
         known_s = np.array(stored["times_s"], np.float64)
         mean_m, std_m = (np.array(stored[f"{key}_distance_m"], np.float64) for key in ("mean", "std"))
         if abs(known_s[0] - times_s[0]) > 1e-6:
             return None
         return Twins(np.interp(times_s, known_s, mean_m), np.interp(times_s, known_s, std_m))
     except (OSError, ValueError, KeyError, TypeError, IndexError) as error:
-        remedy = "delete it, or make it again: python -m data_gen.twins"
         raise DataError(path, f"{type(error).__name__}: {error}", "what data_gen.twins writes", remedy) from None
 
 

@@ -20,6 +20,7 @@ from gns_pyg.evaluation.ensemble import Ensemble
 from gns_pyg.evaluation.errors import mean_present, present
 from gns_pyg.evaluation.metrics import CaseEvaluation, Evaluation, Observables
 from gns_pyg.evaluation.observables import finite_difference_velocity
+from gns_pyg.files import whole
 from gns_pyg.scene.mesh import build_mesh
 from gns_pyg.scene.motion import to_world
 from gns_pyg.scene.scene import Motion, Scene
@@ -44,10 +45,10 @@ def write_plots(evaluation: Evaluation, scene: Scene, folder: str | Path) -> lis
 
 def write_figure(figure: Figure, path: Path) -> list[Path]:
     """Writes a figure as `path`.png and `path`.svg; returns both."""
-    path.parent.mkdir(parents=True, exist_ok=True)
     files = [path.with_name(f"{path.name}.{ending}") for ending in ("png", "svg")]
     for file in files:
-        figure.savefig(file, dpi=150)
+        with whole(file) as temporary:
+            figure.savefig(temporary, format=file.suffix[1:], dpi=150)
     return files
 
 

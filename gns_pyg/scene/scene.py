@@ -18,6 +18,7 @@ from gns_pyg.config import require, typed
 from gns_pyg.errors import ConfigError
 from gns_pyg.scene.travel import FUNCTION, travel
 
+MOST_FRAMES = 1_000_000  # every one of them is looked at when a scene with a moving wall is read
 FASTEST = 1e6  # rad/s or m/s: a function of time with a higher speed has no finite one (sqrt(t) at t = 0)
 
 
@@ -350,6 +351,8 @@ class Scene:
         a_frame = self.duration_s >= self.frame_dt_s * (1 - 1e-9)
         expected = f"at least one frame, scene.frame_dt_s = {self.frame_dt_s} s"
         require(a_frame, "scene.duration_s", self.duration_s, expected, "raise it, or lower scene.frame_dt_s")
+        n_frames, expected = self.duration_s / self.frame_dt_s, f"at most {MOST_FRAMES} frames of scene.frame_dt_s"
+        require(n_frames < MOST_FRAMES, "scene.duration_s", self.duration_s, expected, "lower it")
         require(self.cases >= 1, "scene.cases", self.cases, "at least 1", "set it to the number of cases")
         require(self.seed >= 0, "scene.seed", self.seed, "at least 0", "any whole number from 0 on")
         require(

@@ -96,7 +96,7 @@ class RolloutMetrics(pl.Callback):
     def on_train_batch_end(self, trainer: pl.Trainer, module: pl.LightningModule, outputs, batch, batch_idx) -> None:
         update = trainer.global_step
         cases = trainer.datamodule.cases.val  # type: ignore[attr-defined]
-        if not cases or (update % self.every_n_updates and update < trainer.max_steps):
+        if not cases or not trainer.is_global_zero or (update % self.every_n_updates and update < trainer.max_steps):
             return
         found = [rollout_metrics(cast(TrainingModule, module).judged, case, self.start_s) for case in cases]
         metrics = {key: float(np.mean([figures[key] for figures, _ in found])) for key in found[0][0]}

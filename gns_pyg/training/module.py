@@ -1,22 +1,25 @@
 """What Lightning drives: one update of a simulator."""
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from typing import Any, cast
 
+import numpy as np
 import pytorch_lightning as pl
 import torch
 from jaxtyping import Float
 from pytorch_lightning.utilities.types import OptimizerLRScheduler
 from torch import Tensor
+from torch import distributed as dist
 from torch.optim.swa_utils import AveragedModel, get_ema_multi_avg_fn
 
 from gns_pyg.dynamics.simulator import Simulator
 from gns_pyg.dynamics.tiles import ball
-from gns_pyg.errors import ConfigError, NumericalError
+from gns_pyg.errors import CheckpointError, ConfigError, NumericalError
 from gns_pyg.scene.symmetry import symmetry
 from gns_pyg.state import State, Window
 from gns_pyg.training.augment import transform
+from gns_pyg.training.checkpoint import REMEDY
 from gns_pyg.training.config import TrainingConfig
 
 
@@ -25,7 +28,8 @@ class TrainingModule(pl.LightningModule):
 
     The loss is the mean square of the scaled correction's error: for position-only states the paper's (12) up to a
     constant factor; or, with `loss_knee`, its mean length, which a few violent contacts do not rule. Noise and
-    unrolling are drawn from the seed and the update's number, so a resumed run repeats none and skips none.
+    unrolling are drawn from the seed, the update's number and the window's place in its batch, so a resumed run repeats
+    none and skips none, and several processes that share a batch compute what one would.
 
     Args:
         simulator: what is trained.
@@ -36,7 +40,7 @@ class TrainingModule(pl.LightningModule):
     def __init__(self, simulator: Simulator, config: TrainingConfig, identity: Mapping[str, Any] | None = None) -> None:
         super().__init__()
         self.simulator, self.config, self.identity = simulator, config, dict(identity or {})
-        self.symmetry = symmetry(simulator.scene)
+        self.symmetry, self.started = symmetry(simulator.scene), False
         self.average: AveragedModel | None = None
         if config.average_decay:
             self.average = AveragedModel(simulator, multi_avg_fn=get_ema_multi_avg_fn(config.average_decay))
@@ -56,37 +60,70 @@ class TrainingModule(pl.LightningModule):
     def on_save_checkpoint(self, checkpoint: dict[str, Any]) -> None:
         checkpoint["identity"] = self.identity
 
+    def on_train_start(self) -> None:
+        self.started = True
+
     def on_load_checkpoint(self, checkpoint: dict[str, Any]) -> None:
-        """Refuses a checkpoint of another model, data set or way of training, naming the differences."""
+        """Refuses a checkpoint of another model, data set or way of training, naming the differences, and one whose
+        tensors are not those of this model.
+
+        Raises:
+            ConfigError: for the former.
+            CheckpointError: for the latter.
+        """
         then, now = checkpoint.get("identity", {}), self.identity
+        if not isinstance(then, Mapping):
+            raise CheckpointError("ckpt_path", f"identity {then!r:.60}", "a mapping", REMEDY)
         keys = [key for key in sorted({*then, *now}) if then.get(key) != now.get(key)]
         if keys:
             raise ConfigError(
                 "ckpt_path",
                 "; ".join(f"{key} = {then.get(key)}" for key in keys),
                 "; ".join(f"{key} = {now.get(key)}" for key in keys),
-                "resume with the config and data of the checkpoint, or start anew without ckpt_path",
+                "resume with the config and data of the checkpoint, or start anew in another folder without ckpt_path",
             )
+        self._check_tensors(checkpoint)
+
+    def _check_tensors(self, checkpoint: Mapping[str, Any]) -> None:
+        expected: dict[str, Tensor] = dict(self.state_dict())
+        found: dict[str, Any] = dict(checkpoint["state_dict"])
+        (optimizer,) = checkpoint["optimizer_states"]
+        for number, parameter in enumerate(self.simulator.parameters()):
+            for name in ("exp_avg", "exp_avg_sq"):
+                if number in optimizer["state"]:
+                    expected[f"{name} {number}"] = parameter
+                    found[f"{name} {number}"] = optimizer["state"][number][name]
+        for key in sorted({*expected, *found}, key=str):
+            ours, theirs = expected.get(key), found.get(key)
+            told = f"{tuple(theirs.shape)} {theirs.dtype}" if isinstance(theirs, Tensor) else f"{theirs!r:.60}"
+            wanted = "nothing" if ours is None else f"{tuple(ours.shape)} {ours.dtype}, finite"
+            fits = isinstance(theirs, Tensor) and (theirs.shape, theirs.dtype) == (
+                getattr(ours, "shape", None),
+                getattr(ours, "dtype", None),
+            )
+            if not fits or not torch.isfinite(cast(Tensor, theirs)).all():
+                raise CheckpointError("ckpt_path", f"{key}: {told}", wanted, REMEDY)
 
     def training_step(self, window: Window, batch_idx: int) -> Tensor:
-        random = torch.Generator().manual_seed(self.config.seed * 1_000_003 + self.global_step)
+        n_graphs = len(window.time_s)
+        randoms = [self._random(self.global_rank * n_graphs + graph) for graph in range(n_graphs)]
         if self.simulator.requires.symmetry:
-            window = transform(window, self.symmetry, random)
+            window = transform(window, self.symmetry, randoms)
         state, frame = self.simulator.integrator.read(window, 1), 1
-        state = perturb(state, self.config, self.simulator, random)
+        state = perturb(state, self.config, self.simulator, randoms)
         with torch.no_grad():
-            for _ in range(self._own_steps(random)):
+            for _ in range(self._own_steps(self._random())):
                 state, frame = self.simulator(state), frame + 1
         following = self.simulator.integrator.read(window, frame + 1)
         counted = torch.ones_like(state.batch, dtype=torch.bool)
         if window.active is not None and state.active is not None:  # a grain that just entered has no difference yet
             counted = state.active & window.active[frame - 1 : frame + 2].all(dim=0)
         if self.config.region_grains is not None:
-            core, region = ball(state.pos, state.batch, self.config.region_grains, self.simulator.halo_m, random)
+            core, region = ball(state.pos, state.batch, self.config.region_grains, self.simulator.halo_m, randoms)
             counted = (counted & torch.zeros_like(counted).index_fill(0, core, True))[region]
             state, following = state.pick(region), following.pick(region)
         error = (self.simulator.correction(state) - self.simulator.target(state, following))[counted]
-        loss = mean_loss(error, self.config.loss_knee)
+        loss = mean_loss(error, self.config.loss_knee) * share_of_mean(len(error), error.device)
         if not torch.isfinite(loss):
             raise NumericalError(
                 f"training update {self.global_step}",
@@ -94,8 +131,13 @@ class TrainingModule(pl.LightningModule):
                 "a finite loss",
                 "lower training.lr_start or training.unroll; checkpoints/ holds the last state saved before, if any",
             )
-        self.log("train/loss", loss, batch_size=state.n_graphs)
+        self.log("train/loss", loss, batch_size=state.n_graphs, sync_dist=True)
         return loss
+
+    def _random(self, *window: int) -> torch.Generator:
+        """A generator for this update, or for one window of its batch, whichever process computes it."""
+        entropy = np.random.SeedSequence((self.config.seed, self.global_step, *window))
+        return torch.Generator().manual_seed(int(entropy.generate_state(1, np.uint64)[0]))
 
     def _own_steps(self, random: torch.Generator) -> int:
         """0 for half of the updates, else 1 to `unroll`."""
@@ -122,11 +164,27 @@ def mean_loss(error: Float[Tensor, "n d"], knee: float) -> Float[Tensor, ""]:
     return ((squares + knee**2).sqrt() - knee).sum() / max(squares.numel(), 1)
 
 
-def perturb(state: State, config: TrainingConfig, simulator: Simulator, random: torch.Generator) -> State:
-    """A copy of `state` with Gaussian noise on positions, velocities and spins; `state` itself stays as it is."""
+def share_of_mean(rows: int, device: torch.device) -> float:
+    """What a process's mean over `rows` must be multiplied by, so that the mean over processes, which is what their
+    gradients are, is the mean over the rows of all: rows / (mean rows of a process)."""
+    if not dist.is_initialized() or dist.get_world_size() == 1:
+        return 1.0
+    total = torch.tensor(float(rows), device=device)
+    dist.all_reduce(total)
+    return rows * dist.get_world_size() / max(float(total), 1.0)
+
+
+def perturb(state: State, config: TrainingConfig, simulator: Simulator, randoms: Sequence[torch.Generator]) -> State:
+    """A copy of `state` with Gaussian noise on positions, velocities and spins, each graph's drawn from its generator;
+    `state` itself stays as it is."""
+    sizes = torch.bincount(state.batch, minlength=state.n_graphs).tolist()
 
     def noise(like: Tensor) -> Tensor:
-        return torch.randn(like.shape, dtype=like.dtype, generator=random).to(like.device)
+        drawn = [
+            torch.randn((size, 3), dtype=like.dtype, generator=random)
+            for size, random in zip(sizes, randoms, strict=True)
+        ]
+        return torch.cat(drawn).to(like.device)
 
     scale = simulator.statistics
     return replace(

@@ -3,6 +3,7 @@
 import os
 import shutil
 import signal
+import socket
 import subprocess
 import sys
 import time
@@ -13,15 +14,18 @@ import pytest
 from hydra import compose, initialize_config_dir
 
 from data_gen import dem
-from data_gen.dem import clean_stale, run_dem
-from data_gen.generate import CONF, generate
+from data_gen.dem import run_dem
+from data_gen.generate import generate
 from data_gen.initial import Start
+from gns_pyg.config import CONF
 from gns_pyg.data.trajectory import Trajectory
 from gns_pyg.errors import DataError, DependencyError
+from gns_pyg.files import clean_stale
 from gns_pyg.scene.mesh import build_mesh
 from gns_pyg.scene.scene import Scene
 from tests import scenes
 
+HOST = socket.gethostname()
 ROOT = Path(__file__).resolve().parents[2]
 TINY = ["scene=hopper_small", "scene.grains.count=20", "scene.duration_s=0.05"]
 needs_yade = [
@@ -70,11 +74,12 @@ class TestWithoutYade:
     def test_unfinished_files_of_dead_processes_go_and_those_of_live_ones_stay(self, tmp_path) -> None:
         ended = subprocess.Popen(["true"])
         ended.wait()
-        for pid in (ended.pid, os.getpid()):
-            (tmp_path / f".case_000.h5.{pid}.part").touch()
-        (tmp_path / f".case_001.h5.{ended.pid}.part").touch()
+        mine, theirs = (f".case_000.h5.{host}.{pid}.part" for host, pid in ((HOST, os.getpid()), ("other", ended.pid)))
+        for name in (mine, theirs, f".case_000.h5.{HOST}.{ended.pid}.part"):
+            (tmp_path / name).touch()
+        (tmp_path / f".case_001.h5.{HOST}.{ended.pid}.part").touch()
         clean_stale(tmp_path / "case_000.h5")
-        assert names(tmp_path) == sorted([f".case_000.h5.{os.getpid()}.part", f".case_001.h5.{ended.pid}.part"])
+        assert names(tmp_path) == sorted([mine, theirs, f".case_001.h5.{HOST}.{ended.pid}.part"])
 
     def test_a_user_error_is_printed_without_traceback(self, tmp_path) -> None:
         done = run(tmp_path, "scene.initial.z_min_m=9.0")

@@ -35,7 +35,7 @@ def test_many_coincident_grains_are_cut_too() -> None:
 
 def test_a_ball_is_the_nearest_grains_of_each_graph_and_its_margin() -> None:
     pos, batch = random_pos(90), torch.arange(90) // 45
-    core, region = ball(pos, batch, 10, 0.2, torch.Generator().manual_seed(1))
+    core, region = ball(pos, batch, 10, 0.2, [torch.Generator().manual_seed(k) for k in (1, 2)])
     assert torch.bincount(batch[core]).tolist() == [10, 10]
     for graph in (0, 1):
         inside, around = core[batch[core] == graph], region[batch[region] == graph]
@@ -65,7 +65,7 @@ def test_the_loss_of_a_region_is_that_of_its_grains() -> None:
     scene = scenes.scene(300, 5, boundary=WALLS)
     model = simulators.simulator(scene, dtype=torch.float64)
     state = simulators.state_in_box([150], half_m=0.12)
-    core, region = ball(state.pos, state.batch, 20, model.halo_m, torch.Generator().manual_seed(0))
+    core, region = ball(state.pos, state.batch, 20, model.halo_m, [torch.Generator().manual_seed(0)])
     assert len(region) < 150
     weights = list(model.parameters())
     few = model.correction(state.pick(region))[torch.searchsorted(region, core.sort().values)].square().sum()

@@ -33,7 +33,7 @@ def falling(folder, n_frames=40):
 
 def stored(case, **changes):
     values = {"times_s": [0.1, 0.3], "mean_distance_m": [0.0, 2e-3], "std_distance_m": [0.0, 1e-3]} | changes
-    twins_path(case.path).write_text(json.dumps(values))
+    twins_path(case.path).write_text(json.dumps({"content_hash": case.content_hash()} | values))
 
 
 def test_twins_are_read_between_their_frames_and_only_from_the_same_start(tmp_path):

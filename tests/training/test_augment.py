@@ -31,7 +31,7 @@ def rolling(n_graphs=6, n_grains=5):
 def test_rolling_stays_rolling():
     window = rolling()
     before = window.pos.clone()
-    turned = transform(window, ROUND, torch.Generator().manual_seed(1))
+    turned = transform(window, ROUND, [torch.Generator().manual_seed(k) for k in range(6)])
     arm = turned.pos - torch.tensor(CENTER, dtype=torch.float64)
     torch.testing.assert_close(turned.vel, torch.linalg.cross(turned.ang_vel, arm))
     torch.testing.assert_close(turned.pos[..., 2], window.pos[..., 2])
@@ -40,7 +40,7 @@ def test_rolling_stays_rolling():
 
 def test_every_graph_has_its_own_pose_and_keeps_its_distances():
     window = rolling()
-    turned = transform(window, ROUND, torch.Generator().manual_seed(1))
+    turned = transform(window, ROUND, [torch.Generator().manual_seed(k) for k in range(6)])
     center = torch.tensor(CENTER, dtype=torch.float64)
     elements = []
     for graph in range(6):
@@ -58,4 +58,4 @@ def test_every_graph_has_its_own_pose_and_keeps_its_distances():
 
 def test_no_symmetry_no_change():
     window = rolling()
-    assert transform(window, Symmetry(1, None, [0.0, 0.0, 1.0], CENTER), torch.Generator()) is window
+    assert transform(window, Symmetry(1, None, [0.0, 0.0, 1.0], CENTER), [torch.Generator()]) is window

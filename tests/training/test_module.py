@@ -31,7 +31,7 @@ def module():
 def test_noise_is_added_to_a_copy():
     state, training = state_in_box([20]), module()
     before = state.pos.clone(), state.vel.clone(), state.ang_vel.clone()
-    noisy = perturb(state, training.config, training.simulator, torch.Generator().manual_seed(0))
+    noisy = perturb(state, training.config, training.simulator, [torch.Generator().manual_seed(0)])
     assert all(torch.equal(a, b) for a, b in zip(before, (state.pos, state.vel, state.ang_vel), strict=True))
     assert (noisy.pos - state.pos).std().item() == pytest.approx(0.1 * 0.01, rel=0.3)
     assert (noisy.vel - state.vel).std().item() == pytest.approx(0.1 * 0.5, rel=0.3)

@@ -1,0 +1,95 @@
+"""Files on disk: whole under their final name or not there, and folders that one process uses at a time."""
+
+import fcntl
+import os
+import shutil
+import socket
+from collections.abc import Iterator
+from contextlib import contextmanager, suppress
+from pathlib import Path
+
+from gns_pyg.errors import ConfigError, StorageError
+
+REMEDY = "make room or choose another folder, then give the same command again"
+
+
+def unfinished(path: Path) -> Path:
+    """The name under which this process writes what will be `path`: .NAME.HOST.PID.part beside it."""
+    return path.with_name(f".{path.name}.{socket.gethostname()}.{os.getpid()}.part")
+
+
+def clean_stale(path: Path) -> None:
+    """Removes what processes of this machine that are gone left unfinished of `path`."""
+    prefix = f".{path.name}."
+    for found in path.parent.iterdir() if path.parent.is_dir() else ():
+        if found.name.startswith(prefix) and found.name.endswith(".part"):
+            host, _, pid = found.name.removeprefix(prefix).removesuffix(".part").rpartition(".")
+            if host == socket.gethostname() and not (pid.isdigit() and _runs(int(pid))):
+                remove(found)
+
+
+def remove(path: Path) -> None:
+    """Removes a file or a folder, if it is there and can be removed."""
+    if path.is_dir():
+        shutil.rmtree(path, ignore_errors=True)
+    else:
+        with suppress(OSError):
+            path.unlink()
+
+
+@contextmanager
+def whole(path: str | Path) -> Iterator[Path]:
+    """Yields a temporary name beside `path` for a file or a folder; without an error it is renamed to `path` in the
+    end and replaces what was there, else it is removed.
+
+    Raises:
+        StorageError: if it cannot be written; what was at `path` stays.
+    """
+    path = Path(path)
+    temporary = unfinished(path)
+    try:
+        path.parent.mkdir(parents=True, exist_ok=True)
+        clean_stale(path)
+        remove(temporary)
+        yield temporary
+        old = unfinished(path.with_name(f"{path.name}.old"))
+        if path.is_dir():  # renamed, not emptied: it is whole or not there
+            os.replace(path, old)
+        os.replace(temporary, path)
+        remove(old)
+    except OSError as error:
+        raise StorageError(path, str(error), "a folder that can be written to", REMEDY) from None
+    finally:
+        remove(temporary)
+
+
+@contextmanager
+def held(folder: Path) -> Iterator[None]:
+    """Keeps a run folder to this process; the lock ends with the process, however it ends.
+
+    Raises:
+        ConfigError: if another process holds it.
+        StorageError: if it cannot be written to.
+    """
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+        file = (folder / ".lock").open("w")
+    except OSError as error:
+        raise StorageError(folder, str(error), "a folder that can be written to", REMEDY) from None
+    with file:
+        try:
+            fcntl.lockf(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        except OSError:
+            remedy = "wait until it ends, or choose another folder with hydra.run.dir=..."
+            raise ConfigError("folder", f"{folder}: in use by another process", "a run folder", remedy) from None
+        yield
+
+
+def _runs(pid: int) -> bool:
+    try:
+        os.kill(pid, 0)
+    except ProcessLookupError:
+        return False
+    except PermissionError:
+        pass
+    return True

@@ -1,0 +1,38 @@
+"""Starts a command: a Hydra app that ends with a message and status 1, no traceback, where a user can act on it."""
+
+import os
+import sys
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import hydra
+from hydra.errors import HydraException
+from omegaconf import DictConfig
+from omegaconf.errors import OmegaConfBaseException
+
+from gns_pyg.config import CONF
+from gns_pyg.errors import GnsError, StorageError
+from gns_pyg.files import REMEDY, held
+
+
+def launch(config_name: str, function: Callable[[DictConfig], Any]) -> None:
+    """Runs `function` on the composed config, once for every job; each holds its run folder meanwhile."""
+
+    def job(cfg: DictConfig) -> Any:
+        if "folder" not in cfg or int(os.environ.get("LOCAL_RANK", 0)):  # started by Lightning: the first one holds it
+            return function(cfg)
+        with held(Path(cfg.folder)):
+            return function(cfg)
+
+    os.environ["HYDRA_FULL_ERROR"] = "1"  # Hydra hands errors on; else it prints a traceback for each
+    try:
+        hydra.main(config_path=CONF, config_name=config_name, version_base="1.3")(job)()
+    except OSError as error:
+        where = error.filename or "the run folder"
+        sys.exit(f"StorageError: {StorageError(where, str(error), 'a file or folder that can be used', REMEDY)}")
+    except (GnsError, HydraException, OmegaConfBaseException) as error:
+        cause = f"\n{error.__cause__}" if isinstance(error.__cause__, OmegaConfBaseException) else ""
+        sys.exit(f"{type(error).__name__}: {error}{cause}")
+    except KeyboardInterrupt:
+        sys.exit("interrupted; the same command with the same folder (hydra.run.dir=...) goes on")

@@ -1,0 +1,26 @@
+"""A short version of the long fault run (`python -m tests.faults`): damaged and hostile files of every kind."""
+
+import pytest
+
+from tests.faults import mutations, samples
+
+N = {"trajectory.h5": 200, "bundle": 80, "scene.yaml": 80, "mesh.stl": 80, "checkpoint.ckpt": 12}
+
+
+@pytest.fixture(scope="module")
+def sound(tmp_path_factory):
+    folder = tmp_path_factory.mktemp("faults") / "samples"
+    samples.write_samples(folder)
+    return folder
+
+
+def test_the_samples_are_sound(sound):
+    for name, open_it in samples.OPEN.items():
+        open_it(sound / name, sound / "data")
+
+
+@pytest.mark.parametrize("name", N)
+def test_damaged_files_are_refused_in_our_own_words_or_give_sound_objects(sound, name, tmp_path):
+    counts, wrong, _ = mutations.check(name, sound, tmp_path / "work", range(10_000, 10_000 + N[name]))
+    assert wrong == {}
+    assert counts["refused"] > N[name] / 4
