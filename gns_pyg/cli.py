@@ -1,7 +1,9 @@
 """The commands, as the top-level scripts and the installed gns-... programs run them."""
 
 from gns_pyg import run
+from gns_pyg.config import CONF
 from gns_pyg.launch import launch
+from gns_pyg.tradeoff import app
 
 
 def train() -> None:
@@ -17,3 +19,8 @@ def rollout() -> None:
 def evaluate() -> None:
     """gns-evaluate"""
     launch("evaluate", run.evaluate)
+
+
+def tradeoff() -> None:
+    """gns-tradeoff"""
+    launch("tradeoff", app.tradeoff, f"{CONF}/tradeoff")  # a folder of its own: here `experiment` is a plain key

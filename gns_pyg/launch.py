@@ -16,8 +16,9 @@ from gns_pyg.errors import GnsError, StorageError
 from gns_pyg.files import REMEDY, held
 
 
-def launch(config_name: str, function: Callable[[DictConfig], Any]) -> None:
-    """Runs `function` on the composed config, once for every job; each holds its run folder meanwhile."""
+def launch(config_name: str, function: Callable[[DictConfig], Any], configs: str = CONF) -> None:
+    """Runs `function` on the composed config of the folder `configs`, once for every job; each holds its run folder
+    meanwhile."""
 
     def job(cfg: DictConfig) -> Any:
         if "folder" not in cfg or int(os.environ.get("LOCAL_RANK", 0)):  # started by Lightning: the first one holds it
@@ -27,7 +28,7 @@ def launch(config_name: str, function: Callable[[DictConfig], Any]) -> None:
 
     os.environ["HYDRA_FULL_ERROR"] = "1"  # Hydra hands errors on; else it prints a traceback for each
     try:
-        hydra.main(config_path=CONF, config_name=config_name, version_base="1.3")(job)()
+        hydra.main(config_path=configs, config_name=config_name, version_base="1.3")(job)()
     except OSError as error:
         where = error.filename or "the run folder"
         sys.exit(f"StorageError: {StorageError(where, str(error), 'a file or folder that can be used', REMEDY)}")

@@ -59,6 +59,23 @@ def train(cfg: DictConfig) -> dict[str, Any]:
     Returns:
         The metrics that are also written to metrics.json in the run folder.
     """
+    folder, done = Path(cfg.folder), trained(cfg)
+    if done is None:  # the first process judges and writes
+        return {}
+    simulator, cases, expected, card = done
+    unseen = [open_to_compare(case.path, simulator.scene, cfg.compare_every_s) for case in cases.test]
+    metrics = report(simulator, unseen, expected, cfg, {"bundle": folder / "bundle"})
+    bundle.save(folder / "bundle", simulator, strict(card | {"metrics": metrics}))
+    return metrics
+
+
+def trained(cfg: DictConfig) -> tuple[Simulator, Split, Climatology, dict[str, Any]] | None:
+    """Trains and saves a bundle, unjudged.
+
+    Returns:
+        The simulator, the cases, the training cases' mean curves and the bundle's card; None in all processes but the
+        first.
+    """
     check_keys(cfg, TRAIN_KEYS)
     folder, where = Path(cfg.folder), device(cfg)
     scene = Scene.from_config(cfg.scene)
@@ -107,18 +124,15 @@ def train(cfg: DictConfig) -> dict[str, Any]:
     trainer = build_trainer(cfg, training, where)
     fit(trainer, module, datamodule, resume_from)
     trainer.save_checkpoint(folder / "checkpoints" / "last.ckpt")
-    if not trainer.is_global_zero:  # the first process judges and writes
-        return {}
-    trained = module.judged.eval().to(where)
+    if not trainer.is_global_zero:
+        return None
+    simulator = module.judged.eval().to(where)
     expected = climatology(cases.train, scene)
     card = {"cases": used, "training": plain(cfg.training), "climatology": asdict(expected)}
     card["coverage"] = coverage(scene, cases.train)
     card["starts"] = [case.start() for case in (*cases.train, *cases.val)]
-    bundle.save(folder / "bundle", trained, strict(card))
-    unseen = [open_to_compare(case.path, scene, cfg.compare_every_s) for case in cases.test]
-    metrics = report(trained, unseen, expected, cfg, {"bundle": folder / "bundle"})
-    bundle.save(folder / "bundle", trained, strict(card | {"metrics": metrics}))
-    return metrics
+    bundle.save(folder / "bundle", simulator, strict(card))
+    return simulator, cases, expected, card
 
 
 def evaluate(cfg: DictConfig) -> dict[str, Any]:

@@ -5,7 +5,7 @@ from collections.abc import Sequence
 from gns_pyg.data.trajectory import Trajectory
 from gns_pyg.dynamics.simulator import Simulator
 from gns_pyg.evaluation.baselines import FIRST_FRAME, Climatology
-from gns_pyg.evaluation.metrics import Evaluation, case_result, evaluate_cases
+from gns_pyg.evaluation.metrics import CaseResult, Evaluation, case_result, evaluate_cases
 from gns_pyg.evaluation.predict import one_step_errors, roll_out, start_frame
 
 
@@ -15,10 +15,17 @@ def judge(simulator: Simulator, cases: Sequence[Trajectory], climatology: Climat
     Raises:
         NumericalError: if a roll-out diverges; names step, field and grain.
     """
-    results = []
-    for case in cases:
-        start = start_frame(case, start_s)
-        pos, seconds = roll_out(simulator, case, start)
-        errors = one_step_errors(simulator, case)
-        results.append(case_result(case, simulator.scene, pos, start, errors, FIRST_FRAME, seconds))
+    results = [compare(simulator, case, start_s) for case in cases]
     return evaluate_cases(results, climatology, simulator.scene)
+
+
+def compare(simulator: Simulator, case: Trajectory, start_s: float) -> CaseResult:
+    """The roll-out and the single steps of one case, beside DEM.
+
+    Raises:
+        NumericalError: see `judge`.
+    """
+    start = start_frame(case, start_s)
+    pos, seconds = roll_out(simulator, case, start)
+    errors = one_step_errors(simulator, case)
+    return case_result(case, simulator.scene, pos, start, errors, FIRST_FRAME, seconds)

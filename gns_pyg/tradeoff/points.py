@@ -1,0 +1,117 @@
+"""The points of a trade-off: what is trained, what is only run otherwise, and which data all of it rests on."""
+
+import hashlib
+import itertools
+import json
+from collections.abc import Sequence
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from typing import Any
+
+from hydra import compose, initialize_config_dir
+from hydra.core.override_parser.overrides_parser import OverridesParser
+from omegaconf import DictConfig, OmegaConf
+
+from gns_pyg.config import CONF, plain, require
+from gns_pyg.data.datamodule import find_cases
+from gns_pyg.data.trajectory import Trajectory
+from gns_pyg.errors import DataError
+from gns_pyg.scene.scene import Scene
+
+SWEEPS = Path(CONF) / "sweep"
+
+
+@dataclass(frozen=True)
+class Point:
+    """One job and one row of the table.
+
+    Attributes:
+        kind: `trained`, `without_training` (a trained point, run otherwise) or `shipped` (a bundle of the project).
+        training: overrides of train.py; for `shipped` the bundle's name.
+        running: overrides of evaluate.py.
+    """
+
+    kind: str
+    training: tuple[str, ...]
+    running: tuple[str, ...] = ()
+
+    @property
+    def name(self) -> str:
+        if self.kind == "shipped":
+            return ", ".join([f"bundle={self.training[0]}", *self.running])
+        return ", ".join([*(text for text in self.training if not text.startswith("data.dir")), *self.running]) or "default"
+
+
+def points(cfg: DictConfig) -> list[Point]:
+    """Every point of the config, no point twice: the sweeps' in their order, then those without training.
+
+    Raises:
+        ConfigError: for a sweep that does not exist.
+    """
+    found = [Point("trained", training) for name in cfg.sweeps for training in sweep(name)]
+    if cfg.shipped is not None:
+        found.append(Point("shipped", (cfg.shipped,)))
+    for entry in plain(cfg.without_training):
+        kind, of = ("shipped", [cfg.shipped]) if entry["of"] == "shipped" else ("without_training", entry["of"])
+        found.append(Point(kind, tuple(of), tuple(entry["with"])))
+    defaults = ("model.hidden=64", "model.layers=3")  # of conf/model/contact.yaml: the default point is one point
+    of_default = [p for p in found if p.kind == "trained" and p.training == defaults]
+    return [Point("trained", ()) if p in of_default else p for p in dict.fromkeys(found)]
+
+
+def sweep(name: str) -> list[tuple[str, ...]]:
+    """The overrides of every job of conf/sweep/<name>.yaml, as `train.py -m sweep=<name>` runs them."""
+    path = SWEEPS / f"{name}.yaml"
+    known = ", ".join(sorted(file.stem for file in SWEEPS.glob("*.yaml")))
+    require(path.is_file(), "sweeps", name, f"one of {known}", "add conf/sweep/NAME.yaml, or correct the name")
+    params = OmegaConf.to_container(OmegaConf.load(path).hydra.sweeper.params, resolve=False)
+    parsed = OverridesParser.create().parse_overrides([f"{key}={value}" for key, value in params.items()])  # type: ignore[union-attr]
+    axes = []
+    for override in parsed:
+        values = override.sweep_string_iterator() if override.is_sweep_override() else [override.get_value_element_as_str()]
+        axes.append([f"{override.key_or_group}={value}" for value in values])
+    return list(itertools.product(*axes))
+
+
+def config(name: str, overrides: Sequence[str]) -> DictConfig:
+    """The composed config of train.py or evaluate.py."""
+    with initialize_config_dir(CONF, version_base="1.3"):
+        return compose(name, list(overrides))
+
+
+def train_config(cfg: DictConfig, point: Point, *more: str) -> DictConfig:
+    """The config that a point is trained with."""
+    return config("train", [f"experiment={cfg.experiment}", *cfg.overrides, *point.training, *more])
+
+
+def scene_of(cfg: DictConfig) -> Scene:
+    """The scene that all points are judged in, at the frame step of its cases."""
+    return Scene.from_config(train_config(cfg, Point("trained", ())).scene)
+
+
+def digest(cfg: DictConfig, point: Point) -> str:
+    """What a row depends on, as sixteen letters: its overrides, the budget, the data that it learns from and is judged
+    on."""
+    training = train_config(cfg, Point("trained", ()) if point.kind == "shipped" else point)
+    scene = Scene.from_config(training.scene)
+    told = asdict(point) | {
+        "experiment": cfg.experiment,
+        "overrides": list(cfg.overrides),
+        "budget_cpu_s": cfg.budget_cpu_s,
+        "judged": [cfg.start_s, cfg.compare_every_s],
+        "learns_from": _hashes(scene, training.data.dir),
+        "judged_on": _hashes(scene_of(cfg), cfg.data.dir),
+    }
+    return hashlib.sha256(json.dumps(told, sort_keys=True).encode()).hexdigest()[:16]
+
+
+def _hashes(scene: Scene, folder: str | None) -> list[str]:
+    try:
+        return [Trajectory(path).content_hash() for path in find_cases(scene, folder)]
+    except DataError:  # not there (yet): the job will say so
+        return []
+
+
+def as_plain(point: Point) -> dict[str, Any]:
+    """For a row."""
+    return {"name": point.name, "kind": point.kind, "training": list(point.training), "running": list(point.running)}

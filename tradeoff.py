@@ -1,0 +1,6 @@
+"""python tradeoff.py experiment=hopper"""
+
+from gns_pyg import cli
+
+if __name__ == "__main__":
+    cli.tradeoff()
