@@ -9,6 +9,7 @@ from pathlib import Path
 from typing import Any
 
 from hydra import compose, initialize_config_dir
+from hydra.core.global_hydra import GlobalHydra
 from hydra.core.override_parser.overrides_parser import OverridesParser
 from omegaconf import DictConfig, OmegaConf
 
@@ -74,9 +75,14 @@ def sweep(name: str) -> list[tuple[str, ...]]:
 
 
 def config(name: str, overrides: Sequence[str]) -> DictConfig:
-    """The composed config of train.py or evaluate.py."""
-    with initialize_config_dir(CONF, version_base="1.3"):
-        return compose(name, list(overrides))
+    """The composed config of train.py or evaluate.py, inside a command that Hydra runs, too."""
+    around = GlobalHydra.instance()
+    outer, around.hydra = around.hydra, None
+    try:
+        with initialize_config_dir(CONF, version_base="1.3"):
+            return compose(name, list(overrides))
+    finally:
+        GlobalHydra.instance().hydra = outer
 
 
 def train_config(cfg: DictConfig, point: Point, *more: str) -> DictConfig:
