@@ -320,6 +320,10 @@ def load_bundle(cfg: DictConfig) -> Simulator:
     torch.set_float32_matmul_precision("high" if execution.precision == "tf32" else "highest")
     scene = Scene.from_config(cfg.scene) if cfg.get("scene") else None
     simulator = bundle.load(cfg.bundle, scene).to(where)
+    if execution.precision == "float64":
+        simulator = simulator.double()
+    if (sweeps := cfg.get("projection_sweeps")) is not None:
+        simulator.config = replace(simulator.config, projection_sweeps=sweeps)
     simulator.execution = execution
     return simulator
 

@@ -7,7 +7,7 @@ import torch
 from gns_pyg import machine
 from gns_pyg.config import require
 
-PRECISIONS = ("float32", "tf32", "bfloat16")
+PRECISIONS = ("float32", "float64", "tf32", "bfloat16")
 
 
 @dataclass
@@ -41,7 +41,7 @@ class Execution:
             ConfigError: if it cannot.
         """
         cuda = where.type == "cuda"
-        able = {"float32": True, "tf32": cuda, "bfloat16": cuda or machine.has_bfloat16()}[self.precision]
+        able = {"float32": True, "float64": True, "tf32": cuda, "bfloat16": cuda or machine.has_bfloat16()}[self.precision]
         found = f"{self.precision} on a {where.type} without it"
         require(able, "execution.precision", found, "a device that computes in it", "set execution.precision=float32")
         require(cuda or not self.capture, "execution.capture", f"true on a {where.type}", "CUDA", "set it to false")

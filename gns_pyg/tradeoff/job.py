@@ -10,26 +10,33 @@ import tempfile
 import time
 from collections.abc import Sequence
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import pytorch_lightning as pl
 import torch
 from omegaconf import DictConfig
 
 from gns_pyg import bundle, run
-from gns_pyg.data.datamodule import find_cases, open_to_compare
+from gns_pyg.config import typed
+from gns_pyg.data.datamodule import DataConfig, open_to_compare, split
+from gns_pyg.data.trajectory import Trajectory
 from gns_pyg.dynamics.simulator import Simulator
 from gns_pyg.errors import ConfigError, GnsError, StorageError
-from gns_pyg.evaluation.baselines import Climatology
+from gns_pyg.evaluation.baselines import Climatology, climatology
+from gns_pyg.evaluation.errors import positions
 from gns_pyg.evaluation.judge import compare
 from gns_pyg.evaluation.metrics import CaseResult, Evaluation, evaluate_cases, write_json
 from gns_pyg.evaluation.twins import Twins
 from gns_pyg.files import held
 from gns_pyg.scene.scene import Scene
-from gns_pyg.tradeoff.points import Point, as_plain, config, digest, scene_of, train_config
+from gns_pyg.tradeoff import dem
+from gns_pyg.tradeoff.points import NETWORKS, Point, as_plain, config, digest, scene_of, train_config
 
 TRIAL = 60  # updates that tell how many the budget allows
+TWINS = 2  # per case
 QUIET = ["callbacks.progress=null", "callbacks.throughput=null", "callbacks.rollout_metrics=null"]
 log = logging.getLogger(__name__)
 
@@ -83,7 +90,8 @@ def attempt(cfg: DictConfig, point: Point, folder: Path) -> dict[str, Any]:
     """What a row says beside the point's name; `error` instead of figures where it fails."""
     try:
         found = {} if point.kind != "trained" else train(cfg, point, folder)
-        return found | {"error": None} | judged(cfg, point)
+        found |= judged(cfg, point) if point.kind in NETWORKS else beside(cfg, point)
+        return found | {"error": None}
     except StorageError:
         raise
     except (GnsError, RuntimeError, MemoryError) as error:
@@ -166,6 +174,29 @@ def thinned(result: CaseResult, every_s: float) -> CaseResult:
     )
 
 
-def judged_on(cfg: DictConfig) -> list[Path]:
-    """The case files of the scene."""
-    return find_cases(scene_of(cfg), cfg.data.dir)
+def beside(cfg: DictConfig, point: Point) -> dict[str, Any]:
+    """The figures of a row that is no network: Yade at another step, or a yardstick, on the same cases."""
+    training = train_config(cfg, Point("trained", ()), f"data.dir={cfg.data.dir or 'null'}")
+    scene = scene_of(cfg)
+    cases = split(scene, typed(DataConfig, training.data, "data"))
+    expected, start_s = climatology(cases.train, scene), cfg.start_s
+    more: dict[str, Any] = {}
+    match point.kind:
+        case "yade":
+            step = point.training[0] if point.training[0] == "auto" else float(point.training[0])
+            done = [dem.of_step(case, scene, start_s, step) for case in cases.test]
+            results, more = [result for result, _ in done], {"dt_s": done[0][1].dt_s}
+        case "twins":
+            results = [dem.twin(case, scene, start_s, seed) for case in cases.test for seed in range(TWINS)]
+        case "seeds":
+            every = [*cases.train, *cases.val, *cases.test]
+            pairs = [(case, other) for case in cases.test for other in every if other.path != case.path]
+            results = [dem.guess(case, scene, start_s, partial(positions, other)) for case, other in pairs]
+        case _:
+            results = [dem.guess(case, scene, start_s, partial(_frozen, case)) for case in cases.test]
+    return figures(results, expected, scene, cfg.compare_every_s) | more
+
+
+def _frozen(case: Trajectory, start: int) -> np.ndarray:
+    pos = positions(case, start)
+    return np.broadcast_to(pos[:1], pos.shape)

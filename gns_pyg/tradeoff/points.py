@@ -20,6 +20,14 @@ from gns_pyg.errors import DataError
 from gns_pyg.scene.scene import Scene
 
 SWEEPS = Path(CONF) / "sweep"
+NETWORKS = ("trained", "without_training", "shipped")
+NAMES = {  # of the yardsticks
+    "twins": "Yade, started a micrometre away",
+    "seeds": "Yade, another seed",
+    "climatology": "the training cases' mean curves",
+    "frozen": "grains frozen at the start",
+    "trivial": "best trivial single step",
+}
 
 
 @dataclass(frozen=True)
@@ -27,8 +35,9 @@ class Point:
     """One job and one row of the table.
 
     Attributes:
-        kind: `trained`, `without_training` (a trained point, run otherwise) or `shipped` (a bundle of the project).
-        training: overrides of train.py; for `shipped` the bundle's name.
+        kind: `trained`, `without_training` (a trained point, run otherwise), `shipped` (a bundle of the project),
+            `yade`, or a yardstick: `twins`, `seeds`, `climatology`, `frozen`, `trivial`.
+        training: overrides of train.py; for `shipped` the bundle's name, for `yade` the time step.
         running: overrides of evaluate.py.
     """
 
@@ -38,13 +47,17 @@ class Point:
 
     @property
     def name(self) -> str:
+        if self.kind in NAMES:
+            return NAMES[self.kind]
         if self.kind == "shipped":
             return ", ".join([f"bundle={self.training[0]}", *self.running])
+        if self.kind == "yade":
+            return f"Yade, dt = {self.training[0]}" + (" s" if self.training[0] != "auto" else "")
         return ", ".join([*(text for text in self.training if not text.startswith("data.dir")), *self.running]) or "default"
 
 
 def points(cfg: DictConfig) -> list[Point]:
-    """Every point of the config, no point twice: the sweeps' in their order, then those without training.
+    """Every point of the config, no point twice: the sweeps' in their order, those without training, Yade's, yardsticks.
 
     Raises:
         ConfigError: for a sweep that does not exist.
@@ -55,6 +68,8 @@ def points(cfg: DictConfig) -> list[Point]:
     for entry in plain(cfg.without_training):
         kind, of = ("shipped", [cfg.shipped]) if entry["of"] == "shipped" else ("without_training", entry["of"])
         found.append(Point(kind, tuple(of), tuple(entry["with"])))
+    found += [Point("yade", (str(step),)) for step in cfg.dem_steps_s]
+    found += [Point(kind, ()) for kind in NAMES]
     defaults = ("model.hidden=64", "model.layers=3")  # of conf/model/contact.yaml: the default point is one point
     of_default = [p for p in found if p.kind == "trained" and p.training == defaults]
     return [Point("trained", ()) if p in of_default else p for p in dict.fromkeys(found)]
@@ -98,7 +113,7 @@ def scene_of(cfg: DictConfig) -> Scene:
 def digest(cfg: DictConfig, point: Point) -> str:
     """What a row depends on, as sixteen letters: its overrides, the budget, the data that it learns from and is judged
     on."""
-    training = train_config(cfg, Point("trained", ()) if point.kind == "shipped" else point)
+    training = train_config(cfg, point if point.kind in ("trained", "without_training") else Point("trained", ()))
     scene = Scene.from_config(training.scene)
     told = asdict(point) | {
         "experiment": cfg.experiment,
