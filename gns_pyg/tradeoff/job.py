@@ -35,7 +35,7 @@ from gns_pyg.scene.scene import Scene
 from gns_pyg.tradeoff import dem
 from gns_pyg.tradeoff.points import NETWORKS, Point, as_plain, config, digest, scene_of, train_config
 
-TRIAL = 60  # updates that tell how many the budget allows
+TRIAL = 40  # updates that tell how many the budget allows
 TWINS = 2  # per case
 QUIET = ["callbacks.progress=null", "callbacks.throughput=null", "callbacks.rollout_metrics=null"]
 log = logging.getLogger(__name__)
@@ -199,4 +199,4 @@ def beside(cfg: DictConfig, point: Point) -> dict[str, Any]:
 
 def _frozen(case: Trajectory, start: int) -> np.ndarray:
     pos = positions(case, start)
-    return np.broadcast_to(pos[:1], pos.shape)
+    return np.repeat(pos[:1], len(pos), axis=0)
