@@ -1,9 +1,12 @@
 """The commands, as the top-level scripts and the installed gns-... programs run them."""
 
+import sys
+
 from gns_pyg import run
 from gns_pyg.config import CONF
 from gns_pyg.launch import launch
 from gns_pyg.tradeoff import app
+from gns_pyg.tradeoff.recommend import recommend
 
 
 def train() -> None:
@@ -23,4 +26,9 @@ def evaluate() -> None:
 
 def tradeoff() -> None:
     """gns-tradeoff"""
-    launch("tradeoff", app.tradeoff, f"{CONF}/tradeoff")  # a folder of its own: here `experiment` is a plain key
+    configs = f"{CONF}/tradeoff"  # a folder of its own: here `experiment` is a plain key
+    if "recommend" in sys.argv[1:2]:
+        del sys.argv[1]
+        launch("recommend", recommend, configs)
+    else:
+        launch("tradeoff", app.tradeoff, configs)

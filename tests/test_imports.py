@@ -19,7 +19,8 @@ BELOW["report"] = {"report"} | BELOW["evaluation"]
 BELOW["results"] = {"results"} | BELOW["report"]
 BELOW["run"] = {*BELOW, "run"}
 BELOW["launch"] = {"config", "errors", "files"}
-BELOW["cli"] = {"run", "launch"}
+BELOW["tradeoff"] = {*BELOW, "tradeoff"} - {"results", "launch"}
+BELOW["cli"] = {"run", "launch", "tradeoff", "config"}
 IN_YADE = {"data/schema.py": {"errors"}, "data/trajectory.py": {"errors", "data", "files"}, "scene/travel.py": set()}
 FILES = sorted(path for path in PACKAGE.rglob("*.py") if "conf" not in path.relative_to(PACKAGE).parts)
 

@@ -41,7 +41,7 @@ class Execution:
             ConfigError: if it cannot.
         """
         cuda = where.type == "cuda"
-        able = {"float32": True, "float64": True, "tf32": cuda, "bfloat16": cuda or machine.has_bfloat16()}[self.precision]
+        able = {"tf32": cuda, "bfloat16": cuda or machine.has_bfloat16()}.get(self.precision, True)
         found = f"{self.precision} on a {where.type} without it"
         require(able, "execution.precision", found, "a device that computes in it", "set execution.precision=float32")
         require(cuda or not self.capture, "execution.capture", f"true on a {where.type}", "CUDA", "set it to false")

@@ -1,21 +1,38 @@
 """What `tradeoff.py` does, stage by stage."""
 
+import json
 import logging
+from collections.abc import Callable
+from pathlib import Path
 from typing import Any
 
 from omegaconf import DictConfig
 
 from gns_pyg.config import require
+from gns_pyg.evaluation.metrics import write_json
+from gns_pyg.report.plots import write_figure
+from gns_pyg.tradeoff.front import front, seconds
 from gns_pyg.tradeoff.job import do
+from gns_pyg.tradeoff.pictures import draw, write_page
 from gns_pyg.tradeoff.points import points
+from gns_pyg.tradeoff.recommend import told
+from gns_pyg.tradeoff.rows import table
+from gns_pyg.tradeoff.search import search
+from gns_pyg.tradeoff.timing import times
 
 log = logging.getLogger(__name__)
 
 
 def tradeoff(cfg: DictConfig) -> Any:
     """Runs the stage that `cfg` names."""
-    stages = {"run": work, "list": names}
-    require(cfg.stage in stages, "stage", cfg.stage, " or ".join(stages), "pick one of them")
+    stages: dict[str, Callable[[DictConfig], Any]] = {
+        "run": work,
+        "list": names,
+        "time": times,
+        "table": collect,
+        "search": search,
+    }
+    require(cfg.stage in stages, "stage", cfg.stage, ", ".join(stages), "pick one of them")
     return stages[cfg.stage](cfg)
 
 
@@ -38,4 +55,19 @@ def work(cfg: DictConfig) -> list[dict[str, Any]]:
         row = do(cfg, point)
         log.info("%s: %s", point.name, "in work elsewhere" if row is None else row["error"] or "done")
         rows += [] if row is None else [row]
+    return rows
+
+
+def collect(cfg: DictConfig) -> list[dict[str, Any]]:
+    """Writes the table of all finished points, tradeoff.json, beside those of other scenes in `cfg.out`, its figure
+    and the page to point at; prints the front."""
+    rows, out = table(cfg), Path(cfg.out)
+    path = out / "tradeoff.json"
+    others = json.loads(path.read_text()) if path.is_file() else {}
+    write_json(path, others | {cfg.experiment: rows})
+    write_figure(draw(rows, cfg.experiment), out / "figures" / f"tradeoff_{cfg.experiment}")
+    write_page(out / "figures" / f"tradeoff_{cfg.experiment}.html", rows, cfg.experiment)
+    for row in front(rows):
+        log.info("%.3g s per simulated second: %s; %s", seconds(row), row["name"], "; ".join(told(row)))
+    log.info("%d rows -> %s", len(rows), path)
     return rows

@@ -42,7 +42,9 @@ AXES = {
         "roll-out error over the twins'", 1.0, lambda case: _get(case, "rollout_error_over_twin")
     ),
     "center_of_mass_error_m": Axis("centre of mass, mm", 1e3, lambda case: _get(case, "center_of_mass_error_max_m")),
-    "angle_of_repose_error_deg": Axis("angle of repose, degrees", 1.0, lambda case: _get(case, "angle_of_repose_error_deg")),
+    "angle_of_repose_error_deg": Axis(
+        "angle of repose, degrees", 1.0, lambda case: _get(case, "angle_of_repose_error_deg")
+    ),
     "granular_temperature_error": Axis("granular temperature, %", 100.0, _relative("granular_temperature_m2_s2")),
     "overlap_error": Axis("mean overlap, % of a diameter", 100.0, _off("mean_overlap_ratio")),
     "escaped_grains": Axis("escaped grains", 1.0, lambda case: _get(case, "escaped_grains")),

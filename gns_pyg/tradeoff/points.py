@@ -53,11 +53,14 @@ class Point:
             return ", ".join([f"bundle={self.training[0]}", *self.running])
         if self.kind == "yade":
             return f"Yade, dt = {self.training[0]}" + (" s" if self.training[0] != "auto" else "")
-        return ", ".join([*(text for text in self.training if not text.startswith("data.dir")), *self.running]) or "default"
+        return (
+            ", ".join([*(text for text in self.training if not text.startswith("data.dir")), *self.running])
+            or "default"
+        )
 
 
 def points(cfg: DictConfig) -> list[Point]:
-    """Every point of the config, no point twice: the sweeps' in their order, those without training, Yade's, yardsticks.
+    """Every point of the config, no point twice: the sweeps', those without training, Yade's, the yardsticks.
 
     Raises:
         ConfigError: for a sweep that does not exist.
@@ -80,13 +83,19 @@ def sweep(name: str) -> list[tuple[str, ...]]:
     path = SWEEPS / f"{name}.yaml"
     known = ", ".join(sorted(file.stem for file in SWEEPS.glob("*.yaml")))
     require(path.is_file(), "sweeps", name, f"one of {known}", "add conf/sweep/NAME.yaml, or correct the name")
-    params = OmegaConf.to_container(OmegaConf.load(path).hydra.sweeper.params, resolve=False)
-    parsed = OverridesParser.create().parse_overrides([f"{key}={value}" for key, value in params.items()])  # type: ignore[union-attr]
-    axes = []
-    for override in parsed:
-        values = override.sweep_string_iterator() if override.is_sweep_override() else [override.get_value_element_as_str()]
-        axes.append([f"{override.key_or_group}={value}" for value in values])
+    params: Any = OmegaConf.to_container(OmegaConf.load(path).hydra.sweeper.params, resolve=False)
+    axes = [[f"{key}={value}" for value in sweep_values(key, told)] for key, told in params.items()]
     return list(itertools.product(*axes))
+
+
+def sweep_values(key: str, told: object) -> list[str]:
+    """The values that Hydra would run through for `key=told`."""
+    (override,) = OverridesParser.create().parse_overrides([f"{key}={told}"])
+    return (
+        list(override.sweep_string_iterator())
+        if override.is_sweep_override()
+        else [override.get_value_element_as_str()]
+    )
 
 
 def config(name: str, overrides: Sequence[str]) -> DictConfig:

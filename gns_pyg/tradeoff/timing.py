@@ -12,7 +12,7 @@ from typing import Any
 import torch
 from omegaconf import DictConfig
 
-from gns_pyg import machine, run
+from gns_pyg import machine
 from gns_pyg.config import require, typed
 from gns_pyg.data.datamodule import DataConfig, open_to_compare, split
 from gns_pyg.data.trajectory import Trajectory
@@ -34,7 +34,9 @@ def times(cfg: DictConfig) -> dict[str, Any]:
         Name of the point -> what was written.
     """
     require(isinstance(cfg.rounds, int) and cfg.rounds >= 1, "rounds", cfg.rounds, "at least 1", "3 gives a median")
-    todo = [p for p in points(cfg) if p.kind in (*NETWORKS, "yade") and (row_of(cfg, p) or {"error": ""})["error"] is None]
+    todo = [
+        p for p in points(cfg) if p.kind in (*NETWORKS, "yade") and (row_of(cfg, p) or {"error": ""})["error"] is None
+    ]
     scene = scene_of(cfg)
     training = train_config(cfg, Point("trained", ()), f"data.dir={cfg.data.dir or 'null'}")
     case = split(scene, typed(DataConfig, training.data, "data")).test[0]
