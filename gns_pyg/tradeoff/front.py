@@ -81,7 +81,7 @@ def break_even(row: Row, rows: Sequence[Row], cost: Mapping[str, float]) -> floa
     if saved_s <= 0:
         return math.inf
     trained_s = row.get("training_cpu_s")
-    return None if trained_s is None else math.ceil((cost["cases_s"] + trained_s) / saved_s)
+    return None if trained_s is None else float(math.ceil((cost["cases_s"] + trained_s) / saved_s))
 
 
 def choose(rows: Sequence[Row], simulated_s: float, max_seconds: float | None, most: Mapping[str, float]) -> Row | None:

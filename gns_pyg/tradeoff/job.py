@@ -30,7 +30,7 @@ from gns_pyg.evaluation.errors import positions
 from gns_pyg.evaluation.judge import compare
 from gns_pyg.evaluation.metrics import CaseResult, Evaluation, evaluate_cases, write_json
 from gns_pyg.evaluation.twins import Twins
-from gns_pyg.files import held
+from gns_pyg.files import held, remove
 from gns_pyg.scene.scene import Scene
 from gns_pyg.tradeoff import dem
 from gns_pyg.tradeoff.points import NETWORKS, Point, as_plain, config, digest, scene_of, train_config
@@ -102,6 +102,8 @@ def attempt(cfg: DictConfig, point: Point, folder: Path) -> dict[str, Any]:
 def train(cfg: DictConfig, point: Point, folder: Path) -> dict[str, Any]:
     """Trains for the budget's processor time: a short trial tells how many updates that is."""
     torch.set_num_threads(1)
+    for left in folder.glob(".trial_*"):  # of a process that was killed
+        remove(left)
     plan = folder / "plan.json"
     if not plan.is_file():
         with tempfile.TemporaryDirectory(dir=folder, prefix=".trial_") as trial:

@@ -53,6 +53,7 @@ def recommend(cfg: DictConfig) -> dict[str, Any]:
         known = isinstance(value, int | float) and value >= 0
         require(known, f"max_{key}", value, "a number, at least 0", "see conf/tradeoff/recommend.yaml for the units")
     most_s = limits.pop("seconds", None)
+    most_s = None if most_s is None else float(most_s)
     row = choose(rows, cfg.simulated_s, most_s, limits)
     if row is None:
         wanted = ", ".join(

@@ -44,7 +44,7 @@ def table(cfg: DictConfig, among: Sequence[Point] | None = None) -> list[dict[st
         row["within_scatter"] = front.within_scatter(row, rows) if row["error"] is None else False
         if row["kind"] in NETWORKS and row["error"] is None:
             after = front.break_even(row, rows, cost)
-            row["break_even_rollouts"] = "never" if after == math.inf else after
+            row["break_even_rollouts"] = "never" if after == math.inf else after and int(after)
     return rows
 
 
