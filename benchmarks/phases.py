@@ -1,8 +1,10 @@
 """Where a step's time goes: `python -m benchmarks.phases`.
 
-Steps an untrained simulator of the paper's width from recorded states of the full-size drum (generate its case 0
-first), another one in every round, then from 10 and 100 copies of those beds beside each other without walls, on one
-thread. Writes benchmarks/results/phases.json: medians of the milliseconds of every phase.
+    python -m data_gen.generate scene=drum case=0 scene.dem.dt_s=auto scene.duration_s=0.5    # first
+
+Steps an untrained simulator of the paper's width from recorded states of the full-size drum, another one in every
+round, then 10 and 100 such drums, walls and all, as one batch; on one thread. Writes benchmarks/results/phases.json:
+medians of the milliseconds of every phase.
 """
 
 import json
@@ -28,11 +30,12 @@ from gns_pyg.dynamics.boundary import BoundaryPart
 from gns_pyg.dynamics.integrator import Integrator
 from gns_pyg.dynamics.model_config import ModelConfig
 from gns_pyg.dynamics.simulator import Simulator
+from gns_pyg.evaluation.predict import perturbed
 from gns_pyg.graph import features
-from gns_pyg.models.contact_network import ContactNetwork
 from gns_pyg.scene.requirements import Requires, resolve
 from gns_pyg.scene.scene import Scene
 from gns_pyg.state import State
+from gns_pyg.training.config import TrainingConfig
 
 OUT = Path(__file__).parent / "results" / "phases.json"
 PHASES: dict[str, list[tuple[Any, str]]] = {
@@ -45,10 +48,10 @@ PHASES: dict[str, list[tuple[Any, str]]] = {
         (Simulator, "_grain_features"),
         (Simulator, "_wall_features"),
     ],
-    "networks": [(ContactNetwork, "forward")],
     "integration": [(Integrator, "integrate")],
 }
-ROUNDS, FRAME = 9, 150
+NETWORKS = {"boundary network": "wall_network", "particle network": "grain_network"}
+ROUNDS, FRAME, EARLY = 9, 150, 40  # EARLY: what a short run has too
 
 
 def main() -> None:
@@ -61,16 +64,15 @@ def main() -> None:
 @torch.inference_mode()
 def profile(copies: int) -> dict[str, Any]:
     rounds = max(3, ROUNDS // copies) + 1
-    simulator, *states = paper_wide("drum", *range(FRAME, FRAME + rounds))
-    if copies > 1:
-        states = [side_by_side(state, copies) for state in states]
-        simulator.boundary = simulator.wall_network = None
+    simulator, *states = paper_wide("drum", *range(EARLY, EARLY + rounds))
+    states = [perturbed(state, copies, 0.0, seed=0) for state in states]
     seconds: dict[str, list[float]] = defaultdict(list)
     walls: list[float] = []
     for state in states:
         spent: dict[str, float] = defaultdict(float)
         patches = [
-            patch.object(owner, name, timed(getattr(owner, name), spent, phase)) for phase, owner, name in hooks()
+            patch.object(owner, name, timed(getattr(owner, name), spent, phase))
+            for phase, owner, name in hooks(simulator)
         ]
         for change in patches:
             change.start()
@@ -79,7 +81,7 @@ def profile(copies: int) -> dict[str, Any]:
         walls.append(time.perf_counter() - begin)
         for change in patches:
             change.stop()
-        for phase in PHASES:
+        for phase in (*PHASES, *NETWORKS):
             seconds[phase].append(spent[phase])
     row: dict[str, Any] = {"grains": len(state.pos), "edges": n_edges(simulator, state)}
     row["step_ms"] = round(1e3 * median(walls[1:]), 2)
@@ -88,8 +90,9 @@ def profile(copies: int) -> dict[str, Any]:
     return row
 
 
-def hooks() -> list[tuple[str, Any, str]]:
-    return [(phase, owner, name) for phase, places in PHASES.items() for owner, name in places]
+def hooks(simulator: Simulator) -> list[tuple[str, Any, str]]:
+    networks = [(phase, getattr(simulator, name), "forward") for phase, name in NETWORKS.items()]
+    return [(phase, owner, name) for phase, places in PHASES.items() for owner, name in places] + networks
 
 
 def timed(function: Callable, spent: dict[str, float], phase: str) -> Callable:
@@ -109,8 +112,8 @@ def paper_wide(name: str, *frames: int) -> tuple[Any, ...]:
     scene = Scene.from_config(config.scene)
     case = open_case(find_cases(scene, None)[0], scene)
     requires = resolve(scene, {}, Requires())
-    model = typed(ModelConfig, config.model, "model")
-    simulator = run.build(scene, model, requires, Split([case], [], []), seed=0).eval()
+    model, training = typed(ModelConfig, config.model, "model"), typed(TrainingConfig, config.training, "training")
+    simulator = run.build(scene, model, requires, Split([case], [], []), training).eval()
     return simulator, *(simulator.integrator.read(read_window(case, frame, 2), 1) for frame in frames)
 
 
@@ -136,9 +139,10 @@ def n_edges(simulator: Simulator, state: State) -> int:
 
 def table(rows: list[dict[str, Any]]) -> str:
     """The results as Markdown: milliseconds, and shares of the step."""
-    lines = ["| grains | edges | step, ms | " + " | ".join(PHASES) + " | rest |", "|---" * (4 + len(PHASES)) + "|"]
+    phases = (*PHASES, *NETWORKS)
+    lines = ["| grains | edges | step, ms | " + " | ".join(phases) + " | rest |", "|---" * (4 + len(phases)) + "|"]
     for row in rows:
-        spent = [row[f"{phase}, ms"] for phase in PHASES]
+        spent = [row[f"{phase}, ms"] for phase in phases]
         cells = [f"{ms:.1f} ({ms / row['step_ms']:.0%})" for ms in [*spent, row["step_ms"] - sum(spent)]]
         lines.append(f"| {row['grains']:,} | {row['edges']:,} | {row['step_ms']:.0f} | {' | '.join(cells)} |")
     return "\n".join(lines)
