@@ -10,6 +10,7 @@ from omegaconf import DictConfig
 
 from gns_pyg.config import require
 from gns_pyg.evaluation.metrics import write_json
+from gns_pyg.files import whole
 from gns_pyg.report.plots import write_figure
 from gns_pyg.tradeoff.front import front, seconds
 from gns_pyg.tradeoff.job import do
@@ -18,6 +19,7 @@ from gns_pyg.tradeoff.points import points
 from gns_pyg.tradeoff.recommend import told
 from gns_pyg.tradeoff.rows import table
 from gns_pyg.tradeoff.search import search
+from gns_pyg.tradeoff.tables import page
 from gns_pyg.tradeoff.timing import times
 
 log = logging.getLogger(__name__)
@@ -59,12 +61,14 @@ def work(cfg: DictConfig) -> list[dict[str, Any]]:
 
 
 def collect(cfg: DictConfig) -> list[dict[str, Any]]:
-    """Writes the table of all finished points, tradeoff.json, beside those of other scenes in `cfg.out`, its figure
-    and the page to point at; prints the front."""
+    """Writes the table of all finished points beside those of other scenes in `cfg.out`, tradeoff.json and
+    tradeoff_table.md, its figure and the page to point at; prints the front."""
     rows, out = table(cfg), Path(cfg.out)
     path = out / "tradeoff.json"
     others = json.loads(path.read_text()) if path.is_file() else {}
-    write_json(path, others | {cfg.experiment: rows})
+    write_json(path, tables := others | {cfg.experiment: rows})
+    with whole(out / "tradeoff_table.md") as temporary:
+        temporary.write_text(page(tables), encoding="utf-8")
     write_figure(draw(rows, cfg.experiment), out / "figures" / f"tradeoff_{cfg.experiment}")
     write_page(out / "figures" / f"tradeoff_{cfg.experiment}.html", rows, cfg.experiment)
     for row in front(rows):
