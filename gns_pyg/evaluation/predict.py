@@ -1,5 +1,6 @@
 """Running a simulator against a recorded case."""
 
+import logging
 import time
 from collections import deque
 from collections.abc import Callable
@@ -23,6 +24,7 @@ from gns_pyg.errors import DataError
 from gns_pyg.evaluation.errors import position_error
 from gns_pyg.state import State, Window
 
+log = logging.getLogger(__name__)
 MOST_WAITING = 8  # frames that may wait to be written
 
 
@@ -178,12 +180,25 @@ def _run(simulator: Simulator, state: State, n_frames: int, steps: int, see: Cal
     the wall seconds of the roll-out."""
     see(0, state)
     step = Captured(simulator) if simulator.execution.capture else simulator
-    states, seconds = rollout(step, state.to(simulator.scale.device), n_frames * steps), 0.0
+    options: dict[str, Any] = dict(settles=simulator.settles, reach_m=simulator.cutoff_m)
+    states, seconds = rollout(step, state.to(simulator.scale.device), n_frames * steps, **options), 0.0
+    if simulator.guard is not None:
+        simulator.guard.reset()
     for number in range(1, n_frames + 1):
         begin = time.perf_counter()
         following = deque(islice(states, steps), maxlen=1)[0].to("cpu")
         seconds += time.perf_counter() - begin
         see(number, following)
+    if simulator.guard is not None and (first := simulator.guard.first) is not None:
+        log.warning(
+            "%d times a grain would have gone through a wall and was stopped there, first grain %d at %.3g m/s at "
+            "t = %.4g s (%s)",
+            simulator.guard.crossings,
+            first.grain,
+            first.speed_m_s,
+            first.time_s,
+            first.part,
+        )
     return seconds
 
 
