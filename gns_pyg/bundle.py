@@ -2,7 +2,7 @@
 
 import json
 from collections.abc import Mapping
-from dataclasses import asdict, replace
+from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
@@ -18,7 +18,7 @@ from gns_pyg.errors import BundleError
 from gns_pyg.files import whole
 from gns_pyg.models.statistics import Statistics
 from gns_pyg.scene.boundary_points import BoundaryPoints, boundary_points
-from gns_pyg.scene.requirements import Requirements, check_covers, stands
+from gns_pyg.scene.requirements import Requirements, transferred
 from gns_pyg.scene.scene import Scene
 
 FORMAT_VERSION = 2
@@ -108,9 +108,7 @@ def load(folder: str | Path, scene: Scene | None = None) -> Simulator:
         if scene is None:
             points = {name: _points(path, weights, part) for part, name in enumerate(own.boundary)}
         else:
-            check_covers(requires, scene)
-            rest = stands(scene) and requires.free_flight and (requires.rest or not stands(own))
-            requires = replace(requires, active_mask=scene.outlet is not None or scene.inlet is not None, rest=rest)
+            requires = transferred(requires, own, scene)
             points = boundary_points(scene, model.cutoff_wall_radii)
             weights = {key: value for key, value in weights.items() if not key.startswith("boundary.")}
         statistics = typed(Statistics, description.get("statistics"), "statistics")

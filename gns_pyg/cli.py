@@ -17,3 +17,8 @@ def rollout() -> None:
 def evaluate() -> None:
     """gns-evaluate"""
     launch("evaluate", run.evaluate)
+
+
+def stress() -> None:
+    """gns-stress"""
+    launch("stress", run.stress)

@@ -27,15 +27,19 @@ from gns_pyg.dynamics.execution import Execution
 from gns_pyg.dynamics.integrator import Integrator
 from gns_pyg.dynamics.model_config import ModelConfig
 from gns_pyg.dynamics.simulator import Simulator
-from gns_pyg.errors import CheckpointError, ConfigError, GnsError
+from gns_pyg.errors import CheckpointError, ConfigError, GnsError, NumericalError
 from gns_pyg.evaluation.baselines import Climatology, climatology
 from gns_pyg.evaluation.ensemble import roll_out_ensemble
 from gns_pyg.evaluation.judge import judge
 from gns_pyg.evaluation.metrics import strict, write_json
 from gns_pyg.evaluation.predict import start_frame, write_rollout
+from gns_pyg.evaluation.stress import Bench, Line, run_lines
+from gns_pyg.evaluation.stress_hard import HARD
+from gns_pyg.evaluation.stress_measured import MEASURED
 from gns_pyg.report.page import write_page
 from gns_pyg.report.plots import ensemble_spread, write_figure, write_plots
 from gns_pyg.report.table import ensemble_table, metrics_table
+from gns_pyg.report.verdict import draw_verdict, mark, verdict_table
 from gns_pyg.scene.boundary_points import boundary_points
 from gns_pyg.scene.requirements import Requirements, Requires, resolve
 from gns_pyg.scene.scene import Scene
@@ -152,6 +156,50 @@ def rollout(cfg: DictConfig) -> dict[str, Any]:
     seconds = write_rollout(simulator, trajectory, start, path)
     log.info("%.3g s per simulated second -> %s", seconds, path)
     return {"rollout": str(path), "speed/seconds_per_simulated_second": seconds}
+
+
+def stress(cfg: DictConfig) -> dict[str, Any]:
+    """Puts a bundle, or an untrained model, through the extremes; writes stability.json and a picture.
+
+    Returns:
+        `lines`: the verdict (see `evaluation.stress.Line`), as in stability.json.
+
+    Raises:
+        NumericalError: if a hard line does not hold; names them. Everything is written before.
+    """
+    folder, forms = Path(cfg.folder), ("full", "short")
+    require(cfg.form in forms, "form", cfg.form, " or ".join(forms), "short is what the tests run")
+    if cfg.bundle == "untrained":
+        require(cfg.get("scene") is not None, "scene", None, "a scene", "e.g. scene=hopper_small")
+        scene = Scene.from_config(cfg.scene)
+        cases, training = split(scene, DataConfig(dir=cfg.data.dir)), typed(TrainingConfig, cfg.training, "training")
+        requires = resolve(scene, values(cases.train), typed(Requires, cfg.requires, "requires"))
+        simulator = build(scene, typed(ModelConfig, cfg.model, "model"), requires, cases, training).eval()
+        case, covered = (cases.test or cases.train)[0], {}
+    else:
+        named, remedy = cfg.bundle is not None, "bundle=runs/.../bundle, as train.py prints it"
+        require(named, "bundle", "null", "a bundle folder or untrained", remedy)
+        simulator, card = bundle.load(cfg.bundle), bundle.describe(cfg.bundle)["card"]
+        unseen = unseen_cases(simulator.scene, cfg.data.dir, card, None)
+        require(bool(unseen), "data.dir", cfg.data.dir, "a case that the bundle has not seen", "generate one more")
+        case, covered = unseen[0], card["coverage"]
+    bench = Bench(simulator, case, covered, cfg.form == "full", cfg.start_s)
+    lines: list[Line] = []
+    for registry, hard in ((HARD, True), (MEASURED, False)):
+        for line in run_lines(bench, registry, hard, cfg.lines):
+            log.info("%s: %s (%.0f s)", line.line, mark(line), line.seconds)
+            lines.append(line)
+    found = {"bundle": str(cfg.bundle), "scene": simulator.scene.name, "form": cfg.form}
+    found |= {"processor": machine.processor(), "lines": [line.plain() for line in lines], "curves": bench.curves}
+    write_json(folder / "stability.json", found)
+    title = f"{cfg.bundle}: {simulator.scene.name} at the extremes"
+    write_figure(draw_verdict(bench.curves, title), folder / "plots" / "stability")
+    log.info("\n%s", verdict_table(lines, title, {"run folder": folder, "picture": folder / "plots/stability.png"}))
+    failed = [line.line for line in lines if line.holds is False]
+    if failed:
+        remedy = "see stability.json for what was found; docs/stability.md says what helps"
+        raise NumericalError("hard lines", "; ".join(failed), "all of them hold", remedy)
+    return found
 
 
 def roll_out_members(simulator: Simulator, case: Trajectory, start: int, cfg: DictConfig) -> dict[str, Any]:

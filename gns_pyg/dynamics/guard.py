@@ -91,7 +91,7 @@ class PartGuard(nn.Module):
         self.name, self.motion = name, part.motion
         mesh = build_mesh(name, part)
         mesh.update_faces(mesh.nondegenerate_faces())
-        inwards = -mesh.face_normals if mesh.is_watertight or part.shape.get("open_bottom") else mesh.face_normals
+        inwards = -mesh.face_normals if mesh.is_watertight else mesh.face_normals
         size = float(mesh.extents.max())
         self.tolerance_m = EDGE * size
         offset = (inwards * mesh.triangles[:, 0]).sum(axis=1)

@@ -9,6 +9,7 @@ import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor, nn
 
+from gns_pyg.config import require
 from gns_pyg.dynamics.boundary import Boundary
 from gns_pyg.dynamics.execution import Execution
 from gns_pyg.dynamics.free_grains import among, can_touch
@@ -27,6 +28,8 @@ from gns_pyg.scene.boundary_points import BoundaryPoints
 from gns_pyg.scene.requirements import Requirements
 from gns_pyg.scene.scene import PARAMETERS, Scene
 from gns_pyg.state import Graph, State, Walls, constant
+
+FARTHEST = 20.0  # standard deviations of the training cases' positions
 
 
 class Simulator(nn.Module):
@@ -230,6 +233,18 @@ class Simulator(nn.Module):
         if self.config.absolute_position:
             columns.append(self._absolute(walls.pos))
         return torch.cat(columns, dim=1).to(self.scale.dtype)
+
+    def check_place(self, state: State) -> None:
+        """Raises ConfigError if the model sees absolute positions and the grains are far from where it learned them."""
+        if self.config.absolute_position and len(state.pos):
+            farthest = float(self._absolute(state.pos).abs().max())
+            require(
+                farthest <= FARTHEST,
+                "model.absolute_position",
+                f"true, and a grain {farthest:.3g} standard deviations from the training cases' mean position",
+                f"at most {FARTHEST:g}: the model knows no other place",
+                "simulate where it was trained, or train with model.absolute_position=false",
+            )
 
     def _absolute(self, pos: Tensor) -> Tensor:
         return (pos - constant(self.statistics.position_mean_m, pos)) / self.statistics.position_std_m

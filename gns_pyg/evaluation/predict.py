@@ -1,6 +1,7 @@
 """Running a simulator against a recorded case."""
 
 import logging
+import math
 import time
 from collections import deque
 from collections.abc import Callable
@@ -20,7 +21,7 @@ from gns_pyg.data.windows import read_window
 from gns_pyg.dynamics.captured import Captured
 from gns_pyg.dynamics.rollout import rollout
 from gns_pyg.dynamics.simulator import Simulator
-from gns_pyg.errors import DataError
+from gns_pyg.errors import DataError, NumericalError
 from gns_pyg.evaluation.errors import position_error
 from gns_pyg.state import State, Window
 
@@ -104,6 +105,9 @@ def write_rollout(simulator: Simulator, trajectory: Trajectory, start: int, path
 
     Returns:
         Wall seconds per simulated second, without the writing.
+
+    Raises:
+        NumericalError: if the roll-out diverges; the frames before lie beside `path` as NAME_stopped.h5.
     """
     scene, n_steps, state = (
         replace(simulator.scene, frame_dt_s=steps_per_frame(simulator, trajectory) * simulator.scene.frame_dt_s),
@@ -128,7 +132,11 @@ def write_rollout(simulator: Simulator, trajectory: Trajectory, start: int, path
             if len(waiting) > MOST_WAITING:
                 waiting.popleft().result()
 
-        seconds = _run(simulator, state, n_steps, steps_per_frame(simulator, trajectory), hand_over)
+        stopped: NumericalError | None = None
+        try:
+            seconds = _run(simulator, state, n_steps, steps_per_frame(simulator, trajectory), hand_over)
+        except NumericalError as error:  # what was good so far is kept, under another name
+            stopped, seconds, writer.path = error, math.nan, path.with_name(f"{path.stem}_stopped{path.suffix}")
         for frame in waiting:
             frame.result()
         writer.finish(
@@ -142,6 +150,9 @@ def write_rollout(simulator: Simulator, trajectory: Trajectory, start: int, path
                 "start_from": trajectory.path.name,
             }
         )
+    if stopped is not None:
+        stopped.remedy += f"; the frames before are in {writer.path}"
+        raise stopped
     return seconds / (n_steps * scene.frame_dt_s)
 
 
@@ -178,6 +189,7 @@ def roll_out_from(simulator: Simulator, trajectory: Trajectory, start: int, stat
 def _run(simulator: Simulator, state: State, n_frames: int, steps: int, see: Callable[[int, State], None]) -> float:
     """Shows `see` the state and the `n_frames` that follow it, each `steps` steps after the last, on the CPU; returns
     the wall seconds of the roll-out."""
+    simulator.check_place(state)
     see(0, state)
     step = Captured(simulator) if simulator.execution.capture else simulator
     options: dict[str, Any] = dict(settles=simulator.settles, reach_m=simulator.cutoff_m)

@@ -5,7 +5,7 @@ forced by one config key (conf/requires/*.yaml), unless that would leave out wha
 """
 
 from collections.abc import Mapping, Sequence
-from dataclasses import asdict, dataclass, field
+from dataclasses import asdict, dataclass, field, replace
 from typing import Any, Union
 
 from gns_pyg.config import require
@@ -146,6 +146,17 @@ def check_covers(trained: Requirements, scene: Scene) -> None:
 def stands(scene: Scene) -> bool:
     """Whether grains can come to rest in a scene: gravity holds them down, and no wall moves."""
     return any(scene.gravity_m_s2) and not any(part.motion.moves for part in scene.boundary.values())
+
+
+def transferred(trained: Requirements, own: Scene, scene: Scene) -> Requirements:
+    """What a model that was trained for `own` is made of in another scene: its networks stay what they are.
+
+    Raises:
+        ConfigError: if the model lacks what the other scene needs (see `check_covers`).
+    """
+    check_covers(trained, scene)
+    rest = stands(scene) and trained.free_flight and (trained.rest or not stands(own))
+    return replace(trained, active_mask=scene.outlet is not None or scene.inlet is not None, rest=rest)
 
 
 def _derive(scene: Scene, parameters: Mapping[str, Sequence[float]]) -> dict[str, tuple[Any, str]]:
