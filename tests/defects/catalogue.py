@@ -207,14 +207,14 @@ DEFECTS = [
         FLIGHT,
         "gravity = constant(scene.gravity_m_s2, pos)",
         "gravity = 2 * constant(scene.gravity_m_s2, pos)",
-        ("tests/dynamics/test_integrator.py::test_free_flight_equals_fine_time_stepping",),
+        ("tests/dynamics/test_integrator.py::test_damping_that_spares_gravity_leaves_plain_ballistics",),
     ),
     Defect(
         "damping left out of free flight",
         FLIGHT,
         "felt = torch.full_like(pos[:, :1], scene.damping)",
         "felt = torch.zeros_like(pos[:, :1])",
-        ("tests/dynamics/test_integrator.py::test_free_flight_equals_fine_time_stepping",),
+        ("tests/evaluation/test_baselines.py::test_ballistic_predictors_are_exact_in_free_flight",),
     ),
     Defect(
         "damping of the scene where the case has its own",
