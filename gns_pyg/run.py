@@ -186,7 +186,7 @@ def stress(cfg: DictConfig) -> dict[str, Any]:
     bench = Bench(simulator, case, covered, cfg.form == "full", cfg.start_s)
     lines: list[Line] = []
     for registry, hard in ((HARD, True), (MEASURED, False)):
-        for line in run_lines(bench, registry, hard, cfg.lines):
+        for line in run_lines(bench, registry, hard, [str(text) for text in cfg.lines]):
             log.info("%s: %s (%.0f s)", line.line, mark(line), line.seconds)
             lines.append(line)
     found = {"bundle": str(cfg.bundle), "scene": simulator.scene.name, "form": cfg.form}

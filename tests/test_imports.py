@@ -17,6 +17,7 @@ BELOW["evaluation"] = {"evaluation", "bundle"} | BELOW["data"]
 BELOW["training"] = {"training"} | BELOW["evaluation"]
 BELOW["report"] = {"report"} | BELOW["evaluation"]
 BELOW["results"] = {"results"} | BELOW["report"]
+BELOW["stability"] = BELOW["results"]
 BELOW["run"] = {*BELOW, "run"}
 BELOW["launch"] = {"config", "errors", "files"}
 BELOW["cli"] = {"run", "launch"}

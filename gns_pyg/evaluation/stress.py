@@ -106,7 +106,7 @@ def run_lines(
 ) -> Iterator[Line]:
     """Tries lines one after the other; one that raises an error does not hold."""
     for name, line in lines.items():
-        if names and not any(part in name for part in names):
+        if names and not any(part.lower() in name.lower() for part in names):
             continue
         begin = time.process_time()
         try:

@@ -1,6 +1,7 @@
 """Edge features, dimensionless: lengths over the grain radius (the mean of two), velocities over the data's scale.
 
-Differences are taken in the state's float64, then cast to the networks' dtype.
+Differences are taken in the state's float64, then cast to the networks' dtype; gaps, which are small differences of
+large lengths, and to which contacts are stiff, too.
 Edge features follow Mayr et al. 2023 (the paper's [17]): relative position, distance, direction and inverse powers of
 the distance; `contact` adds what a contact law would ask for: gap, approach, slip with spin, and the gap to come.
 """
@@ -20,21 +21,21 @@ def grain_edges(
 ) -> Float[Tensor, "n_grain_edges f"]:
     """Features of grain-grain edges; `rel_pos` points from receiver to sender."""
     sender, receiver = graph.grain_edges
-    rel_pos = _between(state.pos, sender, receiver, dtype)
-    own = state.radius.to(dtype)
-    touch = own[sender] + own[receiver]
-    radius = touch / 2
+    exact = _between(state.pos, sender, receiver, state.pos.dtype)
+    touch = state.radius[sender] + state.radius[receiver]
+    rel_pos, radius = exact.to(dtype), (touch / 2).to(dtype)
     distance, direction = _polar(rel_pos, radius)
     features = _geometry(rel_pos, distance, direction, radius)
     if contact:
-        rel_vel = _between(state.vel, sender, receiver, dtype)
-        slip = rel_vel
+        closing = _between(state.vel, sender, receiver, state.vel.dtype)
+        slip = rel_vel = closing.to(dtype)
         if state.ang_vel is not None:  # surface velocities at the contact: v + w x arm, arms of opposite sign
             arm = (state.radius[:, None] * state.ang_vel).to(dtype)
             turning = arm.index_select(0, sender) + arm.index_select(0, receiver)
             slip = rel_vel - torch.linalg.cross(turning, direction)
-        ahead = torch.linalg.vector_norm(rel_pos + rel_vel * dt_s, dim=1)
-        features += _contact(distance - touch, ahead - touch, rel_vel, slip, direction, radius, velocity_m_s, dt_s)
+        gaps = [_length(way) - touch for way in (exact, exact + closing * dt_s)]
+        gap, ahead = (values.to(dtype) for values in gaps)
+        features += _contact(gap, ahead, rel_vel, slip, direction, radius, velocity_m_s)
     return torch.cat(features, dim=1)
 
 
@@ -43,19 +44,23 @@ def wall_edges(
 ) -> Float[Tensor, "n_wall_edges f"]:
     """Features of edges from boundary points to grains; the gap is that to the point's tangent plane."""
     point, grain = graph.wall_edges
-    rel_pos = (walls.pos.index_select(0, point) - state.pos.index_select(0, grain)).to(dtype)
-    radius, normal = state.radius[grain].to(dtype), walls.normal.to(dtype).index_select(0, point)
+    exact, inwards = (
+        walls.pos.index_select(0, point) - state.pos.index_select(0, grain),
+        walls.normal.index_select(0, point),
+    )
+    height, own = -dot(exact, inwards), state.radius[grain]
+    rel_pos, radius, normal = exact.to(dtype), own.to(dtype), inwards.to(dtype)
     distance, direction = _polar(rel_pos, radius)
-    height = -dot(rel_pos, normal)
-    features = [*_geometry(rel_pos, distance, direction, radius), (height / radius)[:, None]]
+    features = [*_geometry(rel_pos, distance, direction, radius), (height / own).to(dtype)[:, None]]
     if contact:
-        rel_vel = (walls.vel.index_select(0, point) - state.vel.index_select(0, grain)).to(dtype)
-        slip = rel_vel
+        closing = walls.vel.index_select(0, point) - state.vel.index_select(0, grain)
+        slip = rel_vel = closing.to(dtype)
         if state.ang_vel is not None:
             arm = (state.radius[:, None] * state.ang_vel).to(dtype)
             slip = rel_vel + torch.linalg.cross(arm.index_select(0, grain), normal)
-        ahead = height - dot(rel_vel, normal) * dt_s
-        features += _contact(height - radius, ahead - radius, rel_vel, slip, -normal, radius, velocity_m_s, dt_s)
+        gap = height - own
+        ahead = gap - dot(closing, inwards) * dt_s
+        features += _contact(gap.to(dtype), ahead.to(dtype), rel_vel, slip, -normal, radius, velocity_m_s)
     return torch.cat(features, dim=1)
 
 
@@ -63,6 +68,10 @@ def dot(a: Float[Tensor, "n 3"], b: Float[Tensor, "n 3"]) -> Float[Tensor, " n"]
     """Scalar products, row by row; several times as fast as a sum over so short an axis."""
     x, y, z = (a * b).unbind(1)
     return x + y + z
+
+
+def _length(vectors: Tensor) -> Tensor:
+    return torch.linalg.vector_norm(vectors, dim=1)
 
 
 def _between(values: Tensor, sender: Tensor, receiver: Tensor, dtype: torch.dtype) -> Tensor:
@@ -98,7 +107,6 @@ def _contact(
     direction: Tensor,
     radius: Tensor,
     velocity_m_s: float,
-    dt_s: float,
 ) -> list[Tensor]:
     approach = dot(rel_vel, direction)[:, None]
     tangential = slip - dot(slip, direction)[:, None] * direction
