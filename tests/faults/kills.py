@@ -21,6 +21,7 @@ from safetensors.torch import load_file
 
 from gns_pyg import run
 from gns_pyg.data.trajectory import Trajectory
+from gns_pyg.files import UNFINISHED
 from gns_pyg.training.checkpoint import Checkpoints
 from tests.faults import samples
 
@@ -168,13 +169,23 @@ def campaign(work: Work, folder: Path, kills: int, seed: int, per_round: int = 4
         if status:
             told.append(f"status {status}: {here.with_suffix('.log').read_text()[-1000:]}")
         else:
-            told += differences(wanted, work.result(here))
+            told += differences(wanted, work.result(here)) + leftovers(here)
         hit += in_round
         recovered += 0 if told else in_round
         wrong += told
         if len(wrong) > 20:
             break
     return hit, recovered, wrong
+
+
+def leftovers(folder: Path, seconds: float = 20) -> list[str]:
+    """Unfinished files that stay when all is done; an orphan of a kill may need a moment to go."""
+    end = time.monotonic() + seconds
+    while found := [f"{path.name} is left" for path in folder.rglob(".*") if path.suffix in UNFINISHED]:
+        if time.monotonic() > end:
+            break
+        time.sleep(0.1)
+    return found
 
 
 def prepared(folder: Path) -> Path:
