@@ -12,7 +12,7 @@ from typing import Any
 from gns_pyg.evaluation.metrics import write_json
 from tests.faults import kills, mutations, samples
 
-FILES = {"trajectory.h5": 5500, "bundle": 2000, "scene.yaml": 2000, "mesh.stl": 1500, "checkpoint.ckpt": 300}
+FILES = {"trajectory.h5": 6500, "bundle": 1000, "scene.yaml": 2200, "mesh.stl": 1500, "checkpoint.ckpt": 200}
 RESULT = Path(__file__).parents[2] / "docs" / "reliability.json"
 
 
