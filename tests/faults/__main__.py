@@ -1,5 +1,5 @@
-"""The long fault run: `python -m tests.faults` (about 40 minutes of a core) writes docs/reliability.json; its parts,
-`python -m tests.faults kills` and `... mutations`, may run side by side."""
+"""The long fault run: `python -m tests.faults` (about 40 minutes of a core) writes docs/reliability.json and the
+figures in docs/reliability.md; parts of it, `python -m tests.faults training sweep mesh.stl`, may run side by side."""
 
 import fcntl
 import json
@@ -11,21 +11,22 @@ from typing import Any
 
 from gns_pyg.evaluation.metrics import write_json
 from tests.faults import kills, mutations, samples
+from tests.faults.page import PAGE, RESULT, with_figures
 
-FILES = {"trajectory.h5": 6500, "bundle": 1000, "scene.yaml": 2200, "mesh.stl": 1500, "checkpoint.ckpt": 200}
-RESULT = Path(__file__).parents[2] / "docs" / "reliability.json"
+FILES = {"trajectory.h5": 6500, "scene.yaml": 2300, "mesh.stl": 1400, "bundle": 600, "checkpoint.ckpt": 150}
 
 
 def main(folder: Path, parts: list[str]) -> None:
     began = time.monotonic()
-    if "kills" in parts:
-        for name, (work, n) in kills.works(folder / "kills").items():
+    for name, (work, n) in kills.works(folder / "kills").items() if not parts or {*parts} - {*FILES} else ():
+        if not parts or name in parts:
             hit, recovered, wrong = kills.campaign(work, folder / "kills" / name.replace(" ", "_"), n, seed=n)
             record("killed", name, {"kills": hit, "recovered": recovered, "wrong": wrong})
             print(name, hit, recovered, *wrong, f"{time.monotonic() - began:.0f} s", sep="\n   ", flush=True)
-    if "mutations" in parts:
+    if not parts or {*parts} & {*FILES}:
         samples.write_samples(folder / "samples")
-        for name, n in FILES.items():
+    for name, n in FILES.items():
+        if not parts or name in parts:
             counts, wrong, peak_mb = mutations.check(name, folder / "samples", folder / "mutated" / name, range(n))
             told = {"peak_memory_mb": round(peak_mb), "unexpected": {str(seed): text for seed, text in wrong.items()}}
             record("opened", name, found := {"files": n, **counts, **told})
@@ -45,8 +46,9 @@ def record(part: str, name: str, entry: dict[str, Any]) -> None:
         found["unexpected_errors"] = sum(len(each["unexpected"]) for each in opened)
         found["peak_memory_mb"] = max((each["peak_memory_mb"] for each in opened), default=None)
         write_json(RESULT, found)
+        PAGE.write_text(with_figures(PAGE.read_text(encoding="utf-8"), found), encoding="utf-8")
 
 
 if __name__ == "__main__":
     with tempfile.TemporaryDirectory() as place:
-        main(Path(place), sys.argv[1:] or ["kills", "mutations"])
+        main(Path(place), sys.argv[1:])
