@@ -4,7 +4,7 @@ import json
 from collections.abc import Mapping
 from dataclasses import asdict, replace
 from pathlib import Path
-from typing import Any
+from typing import Any, cast
 
 import numpy as np
 import torch
@@ -93,7 +93,7 @@ def card(folder: str | Path) -> dict[str, Any]:
     Raises:
         BundleError: if something in it has not the shape that judging and rolling out rely on.
     """
-    path, found = find(folder) / "bundle.json", describe(folder).get("card")
+    path, found = find(folder) / "bundle.json", cast(dict[str, Any], describe(folder).get("card"))
     try:
         hashes = [digest for purpose in ("train", "val", "test") for digest in found["cases"][purpose].values()]
         curves = {key: np.array(curve, float) for key, curve in found["climatology"].items() if curve is not None}
