@@ -104,7 +104,10 @@ def card(folder: str | Path) -> dict[str, Any]:
             "climatology": all(curves[key].shape == shape for key, shape in shapes.items())
             and found["climatology"].keys() == {"times_s", "center_of_mass_m", "angle_of_repose_deg", "outflow"}
             and {"times_s", "center_of_mass_m"} <= curves.keys(),
-            "coverage": all(np.array(limits, float).shape == (2,) for limits in found["coverage"].values()),
+            "coverage": all(
+                len(limits) == 2 and all(type(limit) in (int, float) for limit in limits)
+                for limits in found["coverage"].values()
+            ),
             "starts": all(np.array(start, float).shape[1:] == (3,) for start in found.get("starts", [])),
         }
         wrong = ", ".join(f"card.{key}" for key, holds in sound.items() if not holds)
@@ -144,6 +147,8 @@ def load(folder: str | Path, scene: Scene | None = None) -> Simulator:
             weights = {key: value for key, value in weights.items() if not key.startswith("boundary.")}
         statistics = typed(Statistics, description.get("statistics"), "statistics")
         simulator = Simulator(scene or own, model, requires, points, statistics)
+        if len(simulator.scale) != 3 * (groups := simulator.integrator.n_groups):
+            raise BundleError(path.with_name("bundle.json"), f"{statistics}", f"{groups} scales of corrections", REMEDY)
         if scene is not None:
             weights |= {f"boundary.{k}": v for k, v in (simulator.boundary or nn.Module()).state_dict().items()}
         simulator.load_state_dict(weights)

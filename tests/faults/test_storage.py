@@ -130,6 +130,15 @@ with held(pathlib.Path({str(tmp_path)!r})):
         pass
 
 
+def test_a_second_command_in_a_run_folder_is_refused(tmp_path):
+    folder = tmp_path / "run"
+    words = ["train.py", "experiment=hopper", "training.updates=1", f"hydra.run.dir={folder}"]
+    with held(folder):
+        assert wait(command(lambda _: words)(folder)) != 0
+    assert f"{folder}: in use by another process" in folder.with_suffix(".log").read_text()
+    assert not (folder / "checkpoints").exists()
+
+
 def test_a_folder_whose_replacement_was_killed_between_its_renames_is_back(tmp_path):
     ended = subprocess.Popen(["true"])
     ended.wait()
