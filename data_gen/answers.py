@@ -52,7 +52,7 @@ def answers(cfg: DictConfig) -> dict[str, Any]:
     require(apart, "every", every, "at least 2", "an answer must lie between two states")
     state = simulator.requires.state
     require(state == "full", "bundle", f"a model of state {state}", "one of the full state", "the DEM needs all of it")
-    known = set(bundle.describe(cfg.bundle)["card"]["cases"]["train"].values())
+    known = set(bundle.card(cfg.bundle)["cases"]["train"].values())
     cases = [case for case in open_cases(simulator.scene, cfg.data.dir) if case.content_hash() in known]
     require(bool(cases), "data.dir", "none of the cases", "cases that the bundle was trained on", "name their folder")
     files, n_states = [], 0

@@ -1,8 +1,10 @@
 """Starts a command: a Hydra app that ends with a message and status 1, no traceback, where a user can act on it."""
 
 import os
+import signal
 import sys
 from collections.abc import Callable
+from contextlib import suppress
 from pathlib import Path
 from typing import Any
 
@@ -20,6 +22,8 @@ def launch(config_name: str, function: Callable[[DictConfig], Any]) -> None:
     """Runs `function` on the composed config, once for every job; each holds its run folder meanwhile."""
 
     def job(cfg: DictConfig) -> Any:
+        with suppress(ValueError):  # a launcher that runs jobs in threads
+            signal.signal(signal.SIGTERM, signal.default_int_handler)  # what a cluster sends: end as on Ctrl-C
         if "folder" not in cfg or int(os.environ.get("LOCAL_RANK", 0)):  # started by Lightning: the first one holds it
             return function(cfg)
         with held(Path(cfg.folder)):

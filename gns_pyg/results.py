@@ -14,6 +14,7 @@ import numpy as np
 from gns_pyg import bundle, machine
 from gns_pyg.data.datamodule import EMBEDDED, find_cases, open_to_compare
 from gns_pyg.data.trajectory import Trajectory
+from gns_pyg.errors import DataError
 from gns_pyg.evaluation.baselines import Climatology
 from gns_pyg.evaluation.ensemble import curves, roll_out_ensemble
 from gns_pyg.evaluation.errors import nanmean, positions
@@ -60,10 +61,10 @@ def results(docs: Path, names: Sequence[str] = tuple(BUNDLES)) -> dict[str, Any]
     found: dict[str, Any] = json.loads(path.read_text()) if path.exists() else {}
     for name in names:
         conditions = BUNDLES[name]
-        simulator, card = bundle.load(name), bundle.describe(name)["card"]
+        simulator, card = bundle.load(name), bundle.card(name)
         scene, expected = simulator.scene, Climatology.from_plain(card["climatology"])
-        known = {path.name: open_to_compare(path, scene) for path in find_cases(scene, str(EMBEDDED / scene.name))}
-        unseen = [known[file] for file in card["cases"]["test"]]
+        known = {case.content_hash(): case for case in open_embedded(scene)}
+        unseen = kept_for_testing(known, card)
         log.info("%s: %d unseen cases", name, len(unseen))
         evaluation = judge(simulator, unseen, expected, START_S)
         pictures(evaluation, replace(scene, frame_dt_s=unseen[0].frame_dt_s), docs / "figures", name)
@@ -84,6 +85,23 @@ def results(docs: Path, names: Sequence[str] = tuple(BUNDLES)) -> dict[str, Any]
         write_json(path, found)
     (docs / "results.md").write_text(results_page(strict(found)), encoding="utf-8")
     return found
+
+
+def open_embedded(scene: Scene) -> list[Trajectory]:
+    return [open_to_compare(path, scene) for path in find_cases(scene, str(EMBEDDED / scene.name))]
+
+
+def kept_for_testing(known: Mapping[str, Trajectory], card: Mapping[str, Any]) -> list[Trajectory]:
+    """The cases (content hash -> case) that a bundle kept for testing.
+
+    Raises:
+        DataError: if one of them is not there: figures of other data must not stand in its place.
+    """
+    for file, digest in card["cases"]["test"].items():
+        if digest not in known:
+            found, remedy = f"no case of the hash {digest}", "fetch the data that the bundle was trained beside"
+            raise DataError(file, found, "the run that the bundle kept for testing", remedy)
+    return [known[digest] for digest in card["cases"]["test"].values()]
 
 
 def held_out(name: str, condition: str, expected: Climatology) -> dict[str, Any]:

@@ -130,7 +130,7 @@ def evaluate(cfg: DictConfig) -> dict[str, Any]:
 
     With `scene` that scene's cases are taken and simulated instead: transfer without training.
     """
-    simulator, card = load_bundle(cfg), bundle.describe(cfg.bundle)["card"]
+    simulator, card = load_bundle(cfg), bundle.card(cfg.bundle)
     cases = unseen_cases(simulator.scene, cfg.data.dir, card, cfg.compare_every_s)
     for case in cases:
         warn_outside(simulator.scene, case, start_frame(case, cfg.start_s), card)
@@ -139,7 +139,7 @@ def evaluate(cfg: DictConfig) -> dict[str, Any]:
 
 def rollout(cfg: DictConfig) -> dict[str, Any]:
     """Rolls a bundle out from a recorded case and writes the trajectory in the data's own format."""
-    simulator, card = load_bundle(cfg), bundle.describe(cfg.bundle)["card"]
+    simulator, card = load_bundle(cfg), bundle.card(cfg.bundle)
     if cfg.trajectory is None:
         unseen = unseen_cases(simulator.scene, None, card, None)
         require(
@@ -286,6 +286,7 @@ def build_trainer(cfg: DictConfig, training: TrainingConfig, where: torch.device
         logging.getLogger(name).setLevel(logging.WARNING)
     warnings.filterwarnings("ignore", message=".*treespec, LeafSpec.*")
     warnings.filterwarnings("ignore", message=".*does not have many workers.*")
+    warnings.filterwarnings("ignore", message=".*exists and is not empty.*")  # a run that goes on
     try:
         trainer = pl.Trainer(
             **plain(cfg.trainer),

@@ -13,7 +13,7 @@ import numpy as np
 
 from gns_pyg.data.schema import FIXED_UNITS, GRAINS, H5MD_VERSION, RUN_KEYS, UNITS, violations
 from gns_pyg.errors import DataError, StorageError
-from gns_pyg.files import REMEDY, remove, unfinished
+from gns_pyg.files import REMEDY, clean_stale, remove, unfinished
 
 CHUNK_FRAMES = 8
 STARTERS = 8  # grains whose first positions tell a run
@@ -163,6 +163,7 @@ class TrajectoryWriter:
         self._temporary = unfinished(self.path)
         try:
             self.path.parent.mkdir(parents=True, exist_ok=True)
+            clean_stale(self.path)
             self._file = h5py.File(self._temporary, "w")
             self._create(scene, radius, mass, boundary, decimals, with_active)
         except (OSError, RuntimeError) as error:
