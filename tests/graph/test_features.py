@@ -84,3 +84,17 @@ def test_in_other_units_nothing_changes(scale):
     assert torch.allclose(
         grain_edges(two(), edge, **OPTIONS), grain_edges(two(0.0, scale, root), edge, **scaled), rtol=1e-9, atol=1e-12
     )
+
+
+@pytest.mark.parametrize("gap_m", [1e-6, -1e-6])
+def test_a_gap_of_a_micrometre_is_exact_in_float32(gap_m):
+    """As a difference of float32 lengths it would be off by about 1e-9 m."""
+    state = two()
+    state.pos[1] = tensor(2 * R + gap_m, 0.0, 0.0)
+    grains = Graph(torch.tensor([[1], [0]]), torch.empty(2, 0, dtype=torch.long))
+    in_float32 = OPTIONS | {"dtype": torch.float32}
+    assert split(grain_edges(state, grains, **in_float32))[3][0] == pytest.approx(gap_m / R, rel=1e-6)
+    up = tensor([0.0, 0.0, 1.0])
+    walls = Walls(tensor([0.3 * R, 0.0, -R - gap_m]), up, 0 * up, tensor(0.5))
+    edge = Graph(torch.empty(2, 0, dtype=torch.long), torch.tensor([[0], [0]]), walls)
+    assert split(wall_edges(state, edge, walls, **in_float32))[4][0] == pytest.approx(gap_m / R, rel=1e-6)
