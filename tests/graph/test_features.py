@@ -15,11 +15,11 @@ def tensor(*rows):
 
 
 def two(shift: float = 0.0, scale: float = 1.0, speed: float = 1.0) -> State:
-    """Grain 1 lies 3 R along x from grain 0; it comes, rises and spins, the other stands."""
+    """Grain 1 lies 3 R along x from grain 0; it comes, rises and spins, the other spins where it stands."""
     return State(
         pos=scale * tensor([0.0, 0.0, 0.0], [3 * R, 0.0, 0.0]) + shift,
         vel=speed * tensor([0.0, 0.0, 0.0], [-0.2, 0.0, 0.1]),
-        ang_vel=speed / scale * tensor([0.0, 0.0, 0.0], [0.0, 20.0, 0.0]),
+        ang_vel=speed / scale * tensor([0.0, 30.0, 0.0], [0.0, 20.0, 0.0]),
         radius=scale * tensor(R, R),
         time_s=tensor(0.0),
         batch=torch.zeros(2, dtype=torch.long),
@@ -43,8 +43,8 @@ def test_a_grain_sees_another_one_where_it_is_and_as_it_moves():
     assert gaps == pytest.approx([1, 0, ahead / R - 2])
     assert approach == pytest.approx([-0.4])
     assert rel_vel == pytest.approx([-0.4, 0, 0.2])
-    # the sender's surface on the receiver's side, at -R along x: 0.1 + (0, 20, 0) x (-R, 0, 0) = 0.1 + 0.2 along z
-    assert slip == pytest.approx([0, 0, 0.6])
+    # surfaces at the contact, along z: 0.1 + (0, 20, 0) x (-R, 0, 0) = 0.1 + 0.2, less (0, 30, 0) x (R, 0, 0) = -0.3
+    assert slip == pytest.approx([0, 0, 1.2])
 
 
 def test_a_grain_sees_a_wall_where_it_is_and_as_it_moves():
