@@ -3,7 +3,6 @@ and writes what caught each to docs/defects.json."""
 
 import json
 import sys
-import time
 
 # imported before the forks, so that each starts with them; nothing of the project is, nor any plugin of pytest's
 import h5py  # noqa: F401
@@ -20,13 +19,13 @@ RESULT = ROOT / "docs" / "defects.json"
 
 if __name__ == "__main__":
     torch.set_num_threads(1)
-    part = " ".join(sys.argv[1:])
-    began = time.monotonic()
-    found = campaign([defect for defect in DEFECTS if part in defect.name])
-    missed = [name for name, each in found.items() if each["caught_by"] is None]
-    print(f"{len(found) - len(missed)} of {len(found)} caught, {time.monotonic() - began:.0f} s", *missed, sep="\n")
-    known = (json.loads(RESULT.read_text())["defects"] if RESULT.exists() else {}) | found
-    table = {defect.name: known[defect.name] for defect in DEFECTS if defect.name in known}
-    caught = sum(each["caught_by"] is not None for each in table.values())
-    RESULT.write_text(json.dumps({"caught": caught, "defects": table}, indent=2) + "\n")
+    part, missed = " ".join(sys.argv[1:]), 0
+    found = json.loads(RESULT.read_text())["defects"] if RESULT.exists() else {}
+    for defect, caught_by in campaign([defect for defect in DEFECTS if part in defect.name]):
+        print(f"{defect.name:<58} {defect.file:<36} {caught_by or 'NOT CAUGHT'}", flush=True)
+        missed += caught_by is None
+        found[defect.name] = {"file": defect.file, "caught_by": caught_by}
+        table = {each.name: found[each.name] for each in DEFECTS if each.name in found}
+        caught = sum(each["caught_by"] is not None for each in table.values())
+        RESULT.write_text(json.dumps({"caught": caught, "defects": table}, indent=2) + "\n")
     sys.exit(bool(missed))

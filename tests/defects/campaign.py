@@ -76,11 +76,11 @@ def run(root: Path, tests: Iterable[str]) -> tuple[int, list[str], int]:
     return os.waitstatus_to_exitcode(os.waitpid(child, 0)[1]), failed, int(passed)
 
 
-def campaign(defects: list[Defect]) -> dict[str, dict[str, object]]:
+def campaign(defects: list[Defect]) -> Iterator[tuple[Defect, str | None]]:
     """Shows that the named tests pass without a defect, then applies each to the copy alone.
 
-    Returns:
-        Per defect its file, the first test that failed (None: it was not caught), and pytest's exit status.
+    Yields:
+        Each defect and the first test that failed; None if it was not caught: tests passed, or could not run at all.
 
     Raises:
         RuntimeError: if a named test fails, or does not exist, without a defect.
@@ -89,14 +89,10 @@ def campaign(defects: list[Defect]) -> dict[str, dict[str, object]]:
         status, failed, passed = run(root, tests_of(defects))
         if status or passed < len(tests_of(defects)):
             raise RuntimeError(f"without a defect pytest ends with status {status}, {passed} passed; failed: {failed}")
-        found: dict[str, dict[str, object]] = {}
         for defect in defects:
             path = root / defect.file
             sound = path.read_text()
             path.write_text(defect.applied(root))
             status, failed, _ = run(root, defect.tests)
             path.write_text(sound)
-            caught = failed[0] if status == FAILED and failed else None
-            found[defect.name] = {"file": defect.file, "caught_by": caught, "status": status}
-            print(f"{defect.name:<58} {defect.file:<36} {caught or f'NOT CAUGHT (status {status})'}", flush=True)
-    return found
+            yield defect, failed[0] if status == FAILED and failed else None

@@ -61,8 +61,8 @@ DEFECTS = [
     Defect(
         "edge direction swapped in the features",
         FEATURES,
-        "rel_pos = _between(state.pos, sender, receiver, dtype)",
-        "rel_pos = _between(state.pos, receiver, sender, dtype)",
+        "rel_pos = _between(state.pos, sender, receiver)",
+        "rel_pos = _between(state.pos, receiver, sender)",
         ("tests/graph/test_features.py::test_a_grain_sees_another_one_where_it_is_and_as_it_moves",),
     ),
     Defect(
@@ -75,8 +75,8 @@ DEFECTS = [
     Defect(
         "float32 positions: cast before the difference",
         FEATURES,
-        "return (values.index_select(0, sender) - values.index_select(0, receiver)).to(dtype)",
-        "values = values.to(dtype)\n    return values.index_select(0, sender) - values.index_select(0, receiver)",
+        "return values.index_select(0, sender) - values.index_select(0, receiver)",
+        "low = values.float()\n    return (low.index_select(0, sender) - low.index_select(0, receiver)).double()",
         (
             "tests/graph/test_features.py::test_in_float32_a_thousand_kilometres_away_nothing_changes",
             "tests/dynamics/test_units.py::test_far_from_the_origin_in_float32",
@@ -85,9 +85,16 @@ DEFECTS = [
     Defect(
         "float32 positions: cast before the difference to a wall",
         FEATURES,
-        "(walls.pos.index_select(0, point) - state.pos.index_select(0, grain)).to(dtype)",
-        "walls.pos.to(dtype).index_select(0, point) - state.pos.to(dtype).index_select(0, grain)",
+        "rel_pos = walls.pos.index_select(0, point) - state.pos.index_select(0, grain)",
+        "rel_pos = (walls.pos.float().index_select(0, point) - state.pos.float().index_select(0, grain)).double()",
         ("tests/dynamics/test_units.py::test_far_from_the_origin_in_float32",),
+    ),
+    Defect(
+        "float32 gaps: cast before lengths are subtracted",
+        FEATURES,
+        "touch = state.radius[sender] + state.radius[receiver]\n",
+        "rel_pos, touch = rel_pos.to(dtype), (state.radius[sender] + state.radius[receiver]).to(dtype)\n",
+        ("tests/graph/test_features.py::test_a_gap_of_a_micrometre_is_exact_in_float32",),
     ),
     Defect(
         "missing size= where messages are summed",
@@ -108,8 +115,8 @@ DEFECTS = [
     Defect(
         "wrong sign of the wall's velocity, in the features",
         FEATURES,
-        "(walls.vel.index_select(0, point) - state.vel.index_select(0, grain))",
-        "(-walls.vel.index_select(0, point) - state.vel.index_select(0, grain))",
+        "rel_vel = walls.vel.index_select(0, point) - state.vel.index_select(0, grain)",
+        "rel_vel = -walls.vel.index_select(0, point) - state.vel.index_select(0, grain)",
         ("tests/graph/test_features.py::test_a_grain_sees_a_wall_where_it_is_and_as_it_moves",),
     ),
     Defect(

@@ -15,11 +15,11 @@ def tensor(*rows):
 
 
 def two(shift: float = 0.0, scale: float = 1.0, speed: float = 1.0) -> State:
-    """Grain 1 lies 3 R along x from grain 0; it comes, rises and spins, the other stands."""
+    """Grain 1 lies 3 R along x from grain 0; it comes, rises and spins, the other spins where it stands."""
     return State(
         pos=scale * tensor([0.0, 0.0, 0.0], [3 * R, 0.0, 0.0]) + shift,
         vel=speed * tensor([0.0, 0.0, 0.0], [-0.2, 0.0, 0.1]),
-        ang_vel=speed / scale * tensor([0.0, 0.0, 0.0], [0.0, 20.0, 0.0]),
+        ang_vel=speed / scale * tensor([0.0, 30.0, 0.0], [0.0, 20.0, 0.0]),
         radius=scale * tensor(R, R),
         time_s=tensor(0.0),
         batch=torch.zeros(2, dtype=torch.long),
@@ -43,8 +43,8 @@ def test_a_grain_sees_another_one_where_it_is_and_as_it_moves():
     assert gaps == pytest.approx([1, 0, ahead / R - 2])
     assert approach == pytest.approx([-0.4])
     assert rel_vel == pytest.approx([-0.4, 0, 0.2])
-    # the sender's surface on the receiver's side, at -R along x: 0.1 + (0, 20, 0) x (-R, 0, 0) = 0.1 + 0.2 along z
-    assert slip == pytest.approx([0, 0, 0.6])
+    # surfaces at the contact, along z: 0.1 + (0, 20, 0) x (-R, 0, 0) = 0.1 + 0.2, less (0, 30, 0) x (R, 0, 0) = -0.3
+    assert slip == pytest.approx([0, 0, 1.2])
 
 
 def test_a_grain_sees_a_wall_where_it_is_and_as_it_moves():
@@ -84,3 +84,17 @@ def test_in_other_units_nothing_changes(scale):
     assert torch.allclose(
         grain_edges(two(), edge, **OPTIONS), grain_edges(two(0.0, scale, root), edge, **scaled), rtol=1e-9, atol=1e-12
     )
+
+
+@pytest.mark.parametrize("gap_m", [1e-6, -1e-6])
+def test_a_gap_of_a_micrometre_is_exact_in_float32(gap_m):
+    """As a difference of float32 lengths it would be off by about 1e-9 m."""
+    state = two()
+    state.pos[1] = tensor(2 * R + gap_m, 0.0, 0.0)
+    grains = Graph(torch.tensor([[1], [0]]), torch.empty(2, 0, dtype=torch.long))
+    in_float32 = OPTIONS | {"dtype": torch.float32}
+    assert split(grain_edges(state, grains, **in_float32))[3][0] == pytest.approx(gap_m / R, rel=1e-6)
+    up = tensor([0.0, 0.0, 1.0])
+    walls = Walls(tensor([0.3 * R, 0.0, -R - gap_m]), up, 0 * up, tensor(0.5))
+    edge = Graph(torch.empty(2, 0, dtype=torch.long), torch.tensor([[0], [0]]), walls)
+    assert split(wall_edges(state, edge, walls, **in_float32))[4][0] == pytest.approx(gap_m / R, rel=1e-6)
