@@ -47,12 +47,13 @@ def chromium(profile: Path, size: tuple[int, int] = (1200, 1000)) -> Iterator[we
 
 
 def complaints(browser: webdriver.Chrome) -> list[str]:
-    """Warnings and errors on the console since the last call."""
-    return [entry["message"] for entry in browser.get_log("browser") if entry["level"] in ("WARNING", "SEVERE")]
+    """Errors on the console since the last call. (Warnings there are the software renderer's, of its own speed.)"""
+    return [entry["message"] for entry in browser.get_log("browser") if entry["level"] == "SEVERE"]
 
 
 def requests(browser: webdriver.Chrome) -> list[str]:
-    """Addresses that the page asked for since the last call, other than itself and data within it."""
+    """Addresses that pages asked for since the last call, other than the present one and data within it; the browser's
+    own (chrome:, its first tab) left out."""
     events = [json.loads(entry["message"])["message"] for entry in browser.get_log("performance")]
     asked = [event["params"]["request"]["url"] for event in events if event["method"] == "Network.requestWillBeSent"]
-    return [url for url in asked if url != browser.current_url and not url.startswith(("data:", "blob:"))]
+    return [url for url in asked if url != browser.current_url and not url.startswith(("data:", "blob:", "chrome:"))]

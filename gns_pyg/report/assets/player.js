@@ -81,15 +81,25 @@
   controls.zoomToCursor = false;
   controls.addEventListener("change", wake);
 
+  let fit; // what the views show before anyone zooms
   function home() {
     const side = new THREE.Vector3().crossVectors(up, away);
     controls.target.copy(middle);
     camera.position.copy(middle).addScaledVector(away, 5 * reach).addScaledVector(side, 1.8 * reach);
     camera.position.addScaledVector(up, 1.6 * reach);
     camera.zoom = 1;
-    camera.updateProjectionMatrix();
     controls.update();
+    fit = halfBox();
     wake();
+  }
+
+  // Half the width and height of the box around the scene as the camera sees it.
+  function halfBox() {
+    const [right, above] = [new THREE.Vector3(), new THREE.Vector3()];
+    camera.updateMatrixWorld();
+    camera.matrixWorld.extractBasis(right, above, new THREE.Vector3());
+    const edges = meta.box_m[1].map((high, i) => high - meta.box_m[0][i]);
+    return [right, above].map((axis) => edges.reduce((sum, edge, i) => sum + Math.abs(axis.getComponent(i)) * edge / 2, 0));
   }
 
   const colours = new Uint8Array(meta.colours.flatMap((hex) => [1, 3, 5].map((i) => parseInt(hex.slice(i, i + 2), 16)).concat(255)));
@@ -256,7 +266,7 @@
       renderer.setSize(width, height, false);
     }
     const half = width / 2;
-    const tall = 0.62 * reach * Math.max(1, height / half);
+    const tall = 1.12 * Math.max(fit[1], (fit[0] * height) / half);
     [camera.top, camera.bottom, camera.left, camera.right] = [tall, -tall, (-tall * half) / height, (tall * half) / height];
     camera.updateProjectionMatrix();
     const frame = frameAt(state.time_s);
