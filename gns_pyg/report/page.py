@@ -58,14 +58,13 @@ def write_page(
         versions: program or package -> version.
     """
     path = Path(path)
-    simulated = sections.scene_summary(scene) | {"the network was trained on": sections.trained_on(model.card)}
     parts = [
         ("DEM and network", player(shown, scene)),
         ("How good it is", sections.errors(metrics, scene)),
         ("Speed and break-even", sections.speed(metrics, model.card.get("cost"), scene)),
         ("Stability", sections.stability(model.stability, model.name)),
         ("Curves", sections.figures(figures)),
-        ("What was simulated", sections.pairs(simulated)),
+        ("What was simulated", sections.pairs(sections.scene_summary(scene))),
         ("What the scene required of the model", sections.requirements(model.requires)),
         ("Configuration", sections.config(config_yaml)),
         ("Versions", sections.pairs(versions)),
@@ -75,7 +74,7 @@ def write_page(
     text = (
         f'<!DOCTYPE html><html lang="en"><head><meta charset="utf-8"><title>{html.escape(title)}</title>'
         f'<meta name="viewport" content="width=device-width"><style>{style}</style></head>'
-        f"<body><h1>{html.escape(title)}</h1>{body}</body></html>\n"
+        f"<body><h1>{html.escape(title)}</h1>{sections.lead(scene, model.card)}{body}</body></html>\n"
     )
     with whole(path) as temporary:
         temporary.write_text(text, encoding="utf-8")

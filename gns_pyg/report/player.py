@@ -153,7 +153,7 @@ def _meta(
 ) -> Mapping[str, Any]:
     up, toward_reader = view(scene)[1:]
     times_s = result.times_s[kept]
-    remark = f"Case {result.name}: {result.pos.shape[1]} grains."
+    remark = f"{result.name}: {result.pos.shape[1]} grains."
     remark += " Drag to turn, scroll to come closer, right button to shift; both views move together."
     if every > 1:
         remark += (

@@ -61,7 +61,6 @@ def draw(evaluation: Evaluation, scene: Scene) -> dict[str, Figure]:
         "mean_speed": mean_speed(evaluation, scene),
         "granular_temperature": granular_temperature(evaluation, scene),
         "speed_distribution": speed_distribution(evaluation, scene),
-        "snapshots": snapshots(evaluation.cases[0], scene),
     }
     if scene.angle_of_repose is not None:
         figures["angle_of_repose"] = angle_of_repose(evaluation, scene)
@@ -69,7 +68,7 @@ def draw(evaluation: Evaluation, scene: Scene) -> dict[str, Figure]:
         figures["outflow"] = outflow(evaluation, scene)
     if scene.mouth_height_m is not None:
         figures["discharge"] = discharge(evaluation, scene)
-    return figures
+    return figures | {"snapshots": snapshots(evaluation.cases[0], scene)}
 
 
 def rollout_error(evaluation: Evaluation, scene: Scene) -> Figure:
@@ -174,7 +173,9 @@ def overlap(evaluation: Evaluation, scene: Scene) -> Figure:
     _compare(axes, evaluation, lambda observed: 100 * observed.overlap_ratio)
     if any((case.model.overlap_ratio > 0).any() for case in evaluation.cases):
         axes.set_yscale("log")
-    return _finish(figure, axes, handles=_style_handles(evaluation, climatology=False), note="frame 0 is DEM's own")
+    return _finish(
+        figure, axes, handles=_style_handles(evaluation, climatology=False), note="the first frame is DEM's own"
+    )
 
 
 def mean_speed(evaluation: Evaluation, scene: Scene) -> Figure:

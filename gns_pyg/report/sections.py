@@ -50,6 +50,13 @@ def scene_summary(scene: Scene) -> dict[str, str]:
     return summary
 
 
+def lead(scene: Scene, card: Mapping[str, Any]) -> str:
+    """What this is about, in two lines."""
+    summary = scene_summary(scene)
+    text = f"{summary['grains']} grains; walls: {summary['boundary']}; {summary['run']}."
+    return f"<p>{html.escape(text)}<br>The network was trained on {html.escape(trained_on(card))}.</p>"
+
+
 def requirements(requires: Requirements) -> str:
     """Every row of what the scene requires, and why."""
     shown = {True: "yes", False: "no"}
@@ -65,7 +72,8 @@ def errors(metrics: Mapping[str, Any], scene: Scene) -> str:
     """The error table, and the paper's figures where it has such a scene."""
     heading, *rows = metric_rows(metrics)
     kind = next((name for name in PAPER if name in scene.name.split("_")), None)
-    paper = f"<p>The paper's network: {PAPER[kind]}.</p>" if kind else ""
+    other = "" if scene.name == kind else f" {scene.name} is another scene: the figures do not compare."
+    paper = f"<p>The paper's network: {PAPER[kind]}.{html.escape(other)}</p>" if kind else ""
     return table(heading, rows) + paper
 
 
@@ -100,7 +108,7 @@ def trained_on(card: Mapping[str, Any]) -> str:
     """How many cases a bundle has seen, and for what."""
     counts = {purpose: len(files) for purpose, files in card["cases"].items()}
     answers = f" and {counts['answers']} files of answers" if counts.get("answers") else ""
-    return f"{counts['train']} cases{answers}, {counts['val']} for validation"
+    return f"{counts['train']} case{'' if counts['train'] == 1 else 's'}{answers}, {counts['val']} for validation"
 
 
 def config(text: str) -> str:
