@@ -19,7 +19,6 @@ import torch
 from matplotlib.colors import to_hex
 
 from gns_pyg.evaluation.contacts import contacts_per_grain
-from gns_pyg.evaluation.errors import present
 from gns_pyg.evaluation.metrics import CaseResult
 from gns_pyg.evaluation.observables import finite_difference_velocity
 from gns_pyg.report.view import COLOUR_QUANTILE, placed, view
@@ -30,6 +29,7 @@ from gns_pyg.scene.scene import Motion, Scene
 ASSETS = Path(__file__).parent / "assets"
 BUDGET_BYTES = 11_000_000  # of the packed frames, so that a page stays under 15 MB with figures and three.js
 PARTS_OF_RADIUS = 64
+BYTES = 17  # of a grain in a frame, before deflating: two positions, five shades
 ABSENT, UNKNOWN = 65535, 255  # of a coordinate and of a shade
 N_COLOURS = 33
 
@@ -59,7 +59,8 @@ def player(result: CaseResult, scene: Scene, budget_bytes: int = BUDGET_BYTES) -
         budget_bytes: most that the packed frames may take in the page; frames are left out to keep it.
     """
     n_frames, n_grains = result.pos.shape[:2]
-    every = 1 + n_frames * n_grains * 17 // (8 * budget_bytes)  # deflate does not gain more than that
+    raw = n_frames * n_grains * BYTES
+    every = 1 + raw // (8 * budget_bytes)  # a first guess: deflate does not gain more than that
     modes = _modes(result)
     box_m, grid = _grid(result, scene)
     while True:
@@ -105,15 +106,16 @@ class _Grid:
 def _grid(result: CaseResult, scene: Scene) -> tuple[np.ndarray, _Grid]:
     """The box (2, 3) m around walls and DEM's grains, and a grid that reaches once its length beyond on every side: a
     grain further out (a roll-out can lose one) is not drawn, so that it does not cost the others their resolution."""
-    pos = result.dem_pos
-    seen = [pos[present(pos)]]
+    pos, largest = result.dem_pos, result.radius.max()
+    seen = [np.nanmin(pos, axis=(0, 1))[None] - largest, np.nanmax(pos, axis=(0, 1))[None] + largest]
     for name, part in scene.boundary.items():
         mesh = build_mesh(name, part)
-        seen += [placed(mesh, part.motion, float(time_s)) for time_s in result.times_s[:: max(1, len(pos) // 12)]]
+        times_s = result.times_s[:: max(1, len(pos) // 12)] if part.motion.moves else result.times_s[:1]
+        seen += [placed(mesh, part.motion, float(time_s)) for time_s in times_s]
     points = np.concatenate(seen)
     box = np.stack([points.min(axis=0), points.max(axis=0)])
     reach = np.ptp(box, axis=0).max()
-    unit = max(result.radius.min() / PARTS_OF_RADIUS, (np.ptp(box, axis=0).max() + 2 * reach) / (ABSENT - 1))
+    unit = max(result.radius.min() / PARTS_OF_RADIUS, 3 * reach / (ABSENT - 1))
     return box, _Grid(box[0] - reach, unit)
 
 
@@ -125,14 +127,17 @@ def _pack(result: CaseResult, modes: list[Mode], grid: _Grid, kept: np.ndarray) 
         counted = np.round((pos - grid.origin_m) / grid.unit_m)
         within = ((counted >= 0) & (counted < ABSENT)).all(axis=2, keepdims=True)  # nan is not
         stored = _differences(np.where(within, counted, ABSENT).astype(np.uint16))
-        chunks += [deflate.compress((stored & 255).astype(np.uint8)), deflate.compress((stored >> 8).astype(np.uint8))]
+        chunks += [
+            deflate.compress((stored & 255).astype(np.uint8).tobytes()),
+            deflate.compress((stored >> 8).astype(np.uint8).tobytes()),
+        ]
     for mode in modes:
         top = _top(mode)
         for values in mode.values:
             shade = np.round(np.clip(values[kept] / top, 0, 1) * (UNKNOWN - 1))
             known = np.where(np.isfinite(shade), shade, UNKNOWN).astype(np.uint8)
-            chunks.append(deflate.compress(_differences(known)))
-    chunks += [deflate.compress(result.radius.astype("<f4")), deflate.flush()]
+            chunks.append(deflate.compress(_differences(known).tobytes()))
+    chunks += [deflate.compress(result.radius.astype("<f4").tobytes()), deflate.flush()]
     return base64.b64encode(b"".join(chunks)).decode("ascii")
 
 
