@@ -159,7 +159,7 @@ def _meta(
     up, toward_reader = view(scene)[1:]
     times_s = result.times_s[kept]
     remark = f"{result.name}: {result.pos.shape[1]} grains."
-    remark += " Drag to turn, scroll to come closer, right button to shift; both views move together."
+    remark += " Drag to turn, then scroll to come closer; right button to shift. Both views move together."
     if every > 1:
         remark += (
             f" To keep this page small it holds every {every}th frame; between them grains move in straight lines."

@@ -174,6 +174,19 @@ def test_both_views_turn_together(one_grain):
     assert complaints(one_grain.browser) == []
 
 
+def test_scrolling_passes_by_until_the_player_is_clicked(one_grain):
+    order = """
+      const [canvas, clicked] = arguments;
+      canvas.setPointerCapture = canvas.releasePointerCapture = () => {};
+      const mouse = { pointerId: 1, pointerType: "mouse", button: 0, bubbles: true };
+      if (clicked) ["pointerdown", "pointerup"].forEach((kind) => canvas.dispatchEvent(new PointerEvent(kind, mouse)));
+      return canvas.dispatchEvent(new WheelEvent("wheel", { deltaY: 100, bubbles: true, cancelable: true }));
+    """
+    canvas = one_grain.part("canvas")
+    assert one_grain.browser.execute_script(order, canvas, False), "the page may scroll"
+    assert not one_grain.browser.execute_script(order, canvas, True), "the player takes it"
+
+
 def test_moving_walls_turn(browser, tmp_path):
     """The grain is at rest, so what changes is the wall; after a quarter turn a square box stands as before."""
     motion = {"kind": "rotation", "axis": [1.0, 0.0, 0.0], "rate_rad_s": np.pi / 2 / 0.08}

@@ -78,7 +78,9 @@
   camera.up.copy(up);
   camera.far = 20 * reach;
   const controls = new THREE.OrbitControls(camera, canvas);
-  controls.zoomToCursor = false;
+  controls.enableZoom = false; // until clicked, so that whoever scrolls down the page passes by
+  canvas.addEventListener("pointerdown", () => (controls.enableZoom = true));
+  canvas.addEventListener("pointerleave", () => (controls.enableZoom = false));
   controls.addEventListener("change", wake);
 
   let fit; // what the views show before anyone zooms
