@@ -161,9 +161,7 @@ def _meta(
     remark = f"{result.name}: {result.pos.shape[1]} grains."
     remark += " Drag to turn, then scroll to come closer; right button to shift. Both views move together."
     if every > 1:
-        remark += (
-            f" To keep this page small it holds every {every}th frame; between them grains move in straight lines."
-        )
+        remark += f" To keep this page small it holds one frame in {every}; between them grains move in straight lines."
     colours = matplotlib.colormaps["viridis"](np.linspace(0, 1, N_COLOURS))
     return {
         "views": ["DEM (Yade)", "network"],

@@ -105,8 +105,8 @@ def test_frames_are_left_out_to_keep_the_budget_and_the_page_says_so():
     assert 2 < len(meta["times_s"]) < 60
     assert meta["times_s"][0] == 0.0
     assert meta["times_s"][-1] == pytest.approx(0.59)
-    assert "holds every " in meta["remark"]
-    assert "holds every " not in player(result(pos), scenes.scene(200, 60))
+    assert "holds one frame in " in meta["remark"]
+    assert "holds one frame in " not in player(result(pos), scenes.scene(200, 60))
 
 
 def test_a_turning_wall_carries_how_far_it_has_come(tmp_path):
