@@ -53,7 +53,7 @@ def scene_summary(scene: Scene) -> dict[str, str]:
 def lead(scene: Scene, card: Mapping[str, Any]) -> str:
     """What this is about, in two lines."""
     summary = scene_summary(scene)
-    text = f"{summary['grains']} grains; walls: {summary['boundary']}; {summary['run']}."
+    text = f"Grains: {summary['grains']}; walls: {summary['boundary']}; {summary['run']}."
     return f"<p>{html.escape(text)}<br>The network was trained on {html.escape(trained_on(card))}.</p>"
 
 
