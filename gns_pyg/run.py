@@ -14,6 +14,7 @@ import torch
 from hydra.errors import InstantiationException
 from hydra.utils import instantiate
 from omegaconf import DictConfig, OmegaConf
+from pytorch_lightning.callbacks import Timer
 from pytorch_lightning.utilities.exceptions import MisconfigurationException
 from pytorch_lightning.utilities.rank_zero import rank_zero_only
 
@@ -30,13 +31,14 @@ from gns_pyg.dynamics.simulator import Simulator
 from gns_pyg.errors import CheckpointError, ConfigError, GnsError, NumericalError
 from gns_pyg.evaluation.baselines import Climatology, climatology
 from gns_pyg.evaluation.ensemble import roll_out_ensemble
-from gns_pyg.evaluation.judge import judge
-from gns_pyg.evaluation.metrics import strict, write_json
+from gns_pyg.evaluation.errors import positions
+from gns_pyg.evaluation.judge import judge, judge_rollout
+from gns_pyg.evaluation.metrics import Evaluation, dem_seconds, evaluate_cases, strict, write_json
 from gns_pyg.evaluation.predict import start_frame, write_rollout
 from gns_pyg.evaluation.stress import Bench, Line, run_lines
 from gns_pyg.evaluation.stress_hard import HARD
 from gns_pyg.evaluation.stress_measured import MEASURED
-from gns_pyg.report.page import write_page
+from gns_pyg.report.page import Model, read_stability, write_page
 from gns_pyg.report.plots import ensemble_spread, write_figure, write_plots
 from gns_pyg.report.table import ensemble_table, metrics_table
 from gns_pyg.report.verdict import draw_verdict, mark, verdict_table
@@ -108,7 +110,8 @@ def train(cfg: DictConfig) -> dict[str, Any]:
         log.info("going on from %s", last)
         resume_from = str(last)
     set_log_aside(folder)
-    trainer = build_trainer(cfg, training, where)
+    timer = Timer()  # its time is part of a checkpoint: a resumed run goes on counting
+    trainer = build_trainer(cfg, training, where, timer)
     fit(trainer, module, datamodule, resume_from)
     trainer.save_checkpoint(folder / "checkpoints" / "last.ckpt")
     if not trainer.is_global_zero:  # the first process judges and writes
@@ -116,11 +119,12 @@ def train(cfg: DictConfig) -> dict[str, Any]:
     trained = module.judged.eval().to(where)
     expected = climatology(cases.train, scene)
     card = {"cases": used, "training": plain(cfg.training), "climatology": asdict(expected)}
+    card["cost"] = cost(cases, training, timer.time_elapsed("train"), where)
     card["coverage"] = coverage(scene, cases.train)
     card["starts"] = [case.start() for case in (*cases.train, *cases.val)]
     bundle.save(folder / "bundle", trained, strict(card))
     unseen = [open_to_compare(case.path, scene, cfg.compare_every_s) for case in cases.test]
-    metrics = report(trained, unseen, expected, cfg, {"bundle": folder / "bundle"})
+    metrics = judge_and_report(trained, unseen, expected, cfg, folder / "bundle", card)
     bundle.save(folder / "bundle", trained, strict(card | {"metrics": metrics}))
     return metrics
 
@@ -134,11 +138,12 @@ def evaluate(cfg: DictConfig) -> dict[str, Any]:
     cases = unseen_cases(simulator.scene, cfg.data.dir, card, cfg.compare_every_s)
     for case in cases:
         warn_outside(simulator.scene, case, start_frame(case, cfg.start_s), card)
-    return report(simulator, cases, Climatology.from_plain(card["climatology"]), cfg, {})
+    return judge_and_report(simulator, cases, Climatology.from_plain(card["climatology"]), cfg, cfg.bundle, card)
 
 
 def rollout(cfg: DictConfig) -> dict[str, Any]:
-    """Rolls a bundle out from a recorded case and writes the trajectory in the data's own format."""
+    """Rolls a bundle out from a recorded case, writes the trajectory in the data's own format, and compares it with the
+    recorded case."""
     simulator, card = load_bundle(cfg), bundle.card(cfg.bundle)
     if cfg.trajectory is None:
         unseen = unseen_cases(simulator.scene, None, card, None)
@@ -149,13 +154,17 @@ def rollout(cfg: DictConfig) -> dict[str, Any]:
         log.info("from the unseen case %s", trajectory.path)
     else:
         trajectory = open_to_compare(cfg.trajectory, simulator.scene)
+        if seen(trajectory, simulator.scene, card):
+            log.warning("%s: the bundle was trained or validated on this case", trajectory.path.name)
     path, start = Path(cfg.folder) / "rollout.h5", start_frame(trajectory, cfg.start_s)
     warn_outside(simulator.scene, trajectory, start, card)
     if cfg.ensemble is not None:
         return roll_out_members(simulator, trajectory, start, cfg)
     seconds = write_rollout(simulator, trajectory, start, path)
     log.info("%.3g s per simulated second -> %s", seconds, path)
-    return {"rollout": str(path), "speed/seconds_per_simulated_second": seconds}
+    result = judge_rollout(simulator, trajectory, start, positions(Trajectory(path)), seconds)
+    evaluation = evaluate_cases([result], Climatology.from_plain(card["climatology"]), simulator.scene)
+    return {"rollout": str(path)} | report(simulator, [trajectory], evaluation, cfg, cfg.bundle, card)
 
 
 def stress(cfg: DictConfig) -> dict[str, Any]:
@@ -217,17 +226,18 @@ def roll_out_members(simulator: Simulator, case: Trajectory, start: int, cfg: Di
 def unseen_cases(scene: Scene, folder: str | None, card: dict[str, Any], every_s: float | None) -> list[Trajectory]:
     """The cases of a scene (see `open_to_compare`) that a bundle was neither trained nor validated on: neither their
     content nor, however they were recorded, their start is that of one that it was."""
-    seen = {digest for purpose in ("train", "val") for digest in card["cases"][purpose].values()}
+    cases = [open_to_compare(path, scene, every_s) for path in find_cases(scene, folder)]
+    return [case for case in cases if not seen(case, scene, card)]
+
+
+def seen(case: Trajectory, scene: Scene, card: dict[str, Any]) -> bool:
+    """Whether a bundle was trained or validated on a case."""
+    digests = {digest for purpose in ("train", "val") for digest in card["cases"][purpose].values()}
     starts = [np.array(start) for start in card.get("starts", [])]  # bundles made before have none
     within_m = SAME_START * scene.grains.radii_m[0]
-
-    def known(case: Trajectory) -> bool:
-        own = case.start()
-        same = (own.shape == start.shape and np.abs(own - start).max() < within_m for start in starts)
-        return case.content_hash() in seen or any(same)
-
-    cases = [open_to_compare(path, scene, every_s) for path in find_cases(scene, folder)]
-    return [case for case in cases if not known(case)]
+    own = case.start()
+    same = (own.shape == start.shape and np.abs(own - start).max() < within_m for start in starts)
+    return case.content_hash() in digests or any(same)
 
 
 def warn_outside(scene: Scene, case: Trajectory, start: int, card: dict[str, Any]) -> None:
@@ -276,8 +286,8 @@ def build(
     return simulator
 
 
-def build_trainer(cfg: DictConfig, training: TrainingConfig, where: torch.device) -> pl.Trainer:
-    """Lightning's trainer with the config's loggers and callbacks.
+def build_trainer(cfg: DictConfig, training: TrainingConfig, where: torch.device, timer: Timer) -> pl.Trainer:
+    """Lightning's trainer with the config's loggers and callbacks, and a timer.
 
     Raises:
         ConfigError: for keys or values under trainer, logger or callbacks that cannot be built.
@@ -294,7 +304,7 @@ def build_trainer(cfg: DictConfig, training: TrainingConfig, where: torch.device
             max_steps=training.updates,
             gradient_clip_val=training.gradient_clip or None,
             logger=instantiate(cfg.logger),
-            callbacks=[instantiate(callback) for callback in cfg.callbacks.values() if callback is not None],
+            callbacks=[timer, *(instantiate(callback) for callback in cfg.callbacks.values() if callback is not None)],
             default_root_dir=cfg.folder,
             plugins=[Checkpoints()],
             use_distributed_sampler=False,  # UpdateSampler divides batches itself
@@ -368,17 +378,33 @@ def device(cfg: DictConfig) -> torch.device:
     return torch.device("cuda" if cuda and cfg.device != "cpu" else "cpu")
 
 
-def report(
-    simulator: Simulator, cases: list[Trajectory], expected: Climatology, cfg: DictConfig, places: dict[str, Path]
+def judge_and_report(
+    simulator: Simulator,
+    cases: list[Trajectory],
+    expected: Climatology,
+    cfg: DictConfig,
+    bundle_name: str | Path,
+    card: dict[str, Any],
 ) -> dict[str, Any]:
-    """Judges a simulator on unseen cases; writes metrics.json, cases.json, plots and page; prints the table."""
-    folder = Path(cfg.folder)
+    """Judges a simulator on unseen cases and reports it; without a case, an empty metrics.json."""
     if not cases:
         log.info("no unseen case, so nothing to judge the model by")
-        write_json(folder / "metrics.json", {})
+        write_json(Path(cfg.folder) / "metrics.json", {})
         return {}
+    return report(simulator, cases, judge(simulator, cases, expected, cfg.start_s), cfg, bundle_name, card)
+
+
+def report(
+    simulator: Simulator,
+    cases: list[Trajectory],
+    evaluation: Evaluation,
+    cfg: DictConfig,
+    bundle_name: str | Path,
+    card: dict[str, Any],
+) -> dict[str, Any]:
+    """Writes what a simulator did on `cases`: metrics.json, cases.json, plots and page; prints the table."""
+    folder, bundle_folder = Path(cfg.folder), bundle.find(bundle_name)
     scene = replace(simulator.scene, frame_dt_s=cases[0].frame_dt_s)  # of what is compared
-    evaluation = judge(simulator, cases, expected, cfg.start_s)
     metrics = evaluation.metrics | {
         "speed/threads": torch.get_num_threads(),
         "speed/device": device_name(simulator.scale.device),
@@ -386,12 +412,30 @@ def report(
     write_json(folder / "metrics.json", metrics)
     write_json(folder / "cases.json", evaluation.per_case)
     figures = write_plots(evaluation, scene, folder / "plots")
-    title = f"{scene.name}: {len(cases)} unseen cases from {cfg.start_s:g} s on"
+    unseen = not any(seen(case, simulator.scene, card) for case in cases)
+    names = ", ".join(case.path.stem for case in cases)
+    what = f"{names} ({'unseen' if unseen else 'which the model was trained or validated on'})"
+    title = f"{scene.name}: {what} from {cfg.start_s:g} s on"
+    model = Model(str(bundle_name), simulator.requires, card, read_stability(bundle_folder, card))
+    page = folder / "report.html"
     config = OmegaConf.to_yaml(cfg, resolve=True)
-    write_page(folder / "report.html", title, metrics, figures, scene, config, versions(cases[0]))
-    places = {"run folder": folder, **places, "plots": folder / "plots", "report": folder / "report.html"}
+    write_page(page, title, metrics, figures, evaluation.cases[0].result, scene, model, config, versions(cases[0]))
+    places = {"run folder": folder, "bundle": bundle_folder, "plots": folder / "plots", "report": page}
     log.info("\n%s", metrics_table(metrics, title, places))
     return metrics
+
+
+def cost(cases: Split, training: TrainingConfig, seconds: float, where: torch.device) -> dict[str, Any]:
+    """What a bundle has cost: Yade for all it learned from, s, and training, wall s (None where the bundle that it
+    started from does not say)."""
+    start = training.start_from and bundle.describe(training.start_from)["card"].get("cost", {"training_s": None})
+    earlier = start["training_s"] if start else 0.0
+    learned = (*cases.train, *cases.val, *cases.answers)
+    return {
+        "dem_s": sum(dem_seconds(case.run) for case in learned),
+        "training_s": None if earlier is None else earlier + seconds,
+        "training_device": device_name(where),
+    }
 
 
 def device_name(where: torch.device) -> str:

@@ -2,10 +2,12 @@
 
 from collections.abc import Sequence
 
+import numpy as np
+
 from gns_pyg.data.trajectory import Trajectory
 from gns_pyg.dynamics.simulator import Simulator
 from gns_pyg.evaluation.baselines import FIRST_FRAME, Climatology
-from gns_pyg.evaluation.metrics import Evaluation, case_result, evaluate_cases
+from gns_pyg.evaluation.metrics import CaseResult, Evaluation, case_result, evaluate_cases
 from gns_pyg.evaluation.predict import one_step_errors, roll_out, start_frame
 
 
@@ -18,7 +20,14 @@ def judge(simulator: Simulator, cases: Sequence[Trajectory], climatology: Climat
     results = []
     for case in cases:
         start = start_frame(case, start_s)
-        pos, seconds = roll_out(simulator, case, start)
-        errors = one_step_errors(simulator, case)
-        results.append(case_result(case, simulator.scene, pos, start, errors, FIRST_FRAME, seconds))
+        results.append(judge_rollout(simulator, case, start, *roll_out(simulator, case, start)))
     return evaluate_cases(results, climatology, simulator.scene)
+
+
+def judge_rollout(
+    simulator: Simulator, case: Trajectory, start: int, pos: np.ndarray, seconds_per_simulated_second: float
+) -> CaseResult:
+    """Puts a finished roll-out from the case's frame `start`, positions (n_frames - start, n_grains, 3), m, beside DEM,
+    with single steps along the whole case."""
+    errors = one_step_errors(simulator, case)
+    return case_result(case, simulator.scene, pos, start, errors, FIRST_FRAME, seconds_per_simulated_second)
