@@ -19,6 +19,7 @@ BELOW["report"] = {"report"} | BELOW["evaluation"]
 BELOW["results"] = {"results"} | BELOW["report"]
 BELOW["run"] = {*BELOW, "run"}
 BELOW["launch"] = {"config", "errors", "files"}
+BELOW["export"] = {"export", "launch"} | BELOW["report"]
 BELOW["cli"] = {"run", "launch"}
 IN_YADE = {"data/schema.py": {"errors"}, "data/trajectory.py": {"errors", "data", "files"}, "scene/travel.py": set()}
 FILES = sorted(path for path in PACKAGE.rglob("*.py") if "conf" not in path.relative_to(PACKAGE).parts)
