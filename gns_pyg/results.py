@@ -1,5 +1,5 @@
-"""`make results`: judges the bundles that ship with the project and writes docs/results.json, docs/results.md and its
-pictures. Nothing in them is typed by hand."""
+"""`make results`: judges the bundles that ship with the project and writes docs/results.json, docs/results.md, its
+pictures and the bundles' cards. Nothing in them is typed by hand."""
 
 import json
 import logging
@@ -12,6 +12,8 @@ from typing import Any
 import numpy as np
 
 from gns_pyg import bundle, machine
+from gns_pyg.card import FILE as CARD
+from gns_pyg.card import card_page
 from gns_pyg.data.datamodule import EMBEDDED, find_cases, open_to_compare
 from gns_pyg.data.trajectory import Trajectory
 from gns_pyg.evaluation.baselines import Climatology
@@ -82,8 +84,16 @@ def results(docs: Path, names: Sequence[str] = tuple(BUNDLES)) -> dict[str, Any]
             "held_out": {condition: held_out(name, condition, expected) for condition in conditions},
         }
         write_json(path, found)
-    (docs / "results.md").write_text(results_page(strict(found)), encoding="utf-8")
+    write_pages(docs, strict(found))
     return found
+
+
+def write_pages(docs: Path, found: Mapping[str, Any]) -> None:
+    """Writes what people read of the figures: results.md, and beside every judged bundle that ships its card."""
+    (docs / "results.md").write_text(results_page(found), encoding="utf-8")
+    for values in found.values():
+        page = card_page(bundle.describe(values["bundle"]), values["metrics"])
+        (bundle.SHIPPED / values["bundle"] / CARD).write_text(page, encoding="utf-8")
 
 
 def held_out(name: str, condition: str, expected: Climatology) -> dict[str, Any]:
