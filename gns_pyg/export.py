@@ -9,8 +9,13 @@ from gns_pyg.data.trajectory import Trajectory
 from gns_pyg.launch import launch
 from gns_pyg.report.mdanalysis import write_mdanalysis
 from gns_pyg.report.vtk import write_vtk
+from gns_pyg.report.xyz import write_xyz
 
-FORMATS = {"vtk": (write_vtk, "_vtk"), "mdanalysis": (write_mdanalysis, "_mdanalysis.h5md")}  # writer, end of the name
+FORMATS = {  # what writes it, and the end of its name
+    "vtk": (write_vtk, "_vtk"),
+    "xyz": (write_xyz, ".xyz"),
+    "mdanalysis": (write_mdanalysis, "_mdanalysis.h5md"),
+}
 
 
 def export(cfg: DictConfig) -> Path:

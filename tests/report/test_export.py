@@ -90,6 +90,29 @@ def test_mdanalysis_reads_our_positions_velocities_and_times(make, tmp_path):
     assert np.allclose([vel for _, _, vel in frames], 0.01 * case.read("velocity"), rtol=1e-6, atol=1e-8)
 
 
+def test_mdanalysis_reads_our_xyz_and_every_column_is_named(tmp_path):
+    scenes.passing_case(tmp_path / "case.h5")
+    case, file = Trajectory(tmp_path / "case.h5"), write(f"trajectory={tmp_path / 'case.h5'}", "format=xyz")
+    pos, vel = positions(case), case.read("velocity")
+    frames = file.read_text().split("Properties=")
+    assert len(frames) == case.n_frames + 1
+    for frame, (there, text) in enumerate(zip(present(pos), frames[1:], strict=True)):
+        head, *rows = text.splitlines()
+        names, time, _ = head.split(" ", 2)
+        assert names == "species:S:1:pos:R:3:velo:R:3:radius:R:1:id:I:1"
+        assert float(time.removeprefix("Time=")) == pytest.approx(case.times_s[frame])
+        table = np.array([row.split()[1:] for row in rows[: there.sum()]], float)
+        expected = [pos[frame, there], vel[frame, there], case.radius[there, None], np.flatnonzero(there)[:, None]]
+        assert np.allclose(table, np.concatenate(expected, axis=1), rtol=1e-8, atol=0)
+    scenes.rotating_box_case(tmp_path / "box.h5", n_frames=3)  # its reader wants the same particles in all frames
+    with warnings.catch_warnings():  # of its own imports
+        warnings.simplefilter("ignore")
+        from MDAnalysis.coordinates.XYZ import XYZReader
+
+        read = [ts.positions.copy() for ts in XYZReader(str(write(f"trajectory={tmp_path / 'box.h5'}", "format=xyz")))]
+    assert np.allclose(read, Trajectory(tmp_path / "box.h5").read("position"), rtol=1e-6, atol=1e-8)
+
+
 def test_a_folder_that_is_no_export_is_left_alone(tmp_path):
     scenes.passing_case(tmp_path / "case.h5")
     wanted = f"trajectory={tmp_path / 'case.h5'}"
@@ -107,7 +130,7 @@ def test_a_folder_that_is_no_export_is_left_alone(tmp_path):
     [
         ([], ConfigError, "trajectory"),
         (["trajectory=nowhere.h5"], DataError, "no such file"),
-        (["trajectory=nowhere.h5", "format=vtp"], ConfigError, "vtk or mdanalysis"),
+        (["trajectory=nowhere.h5", "format=vtp"], ConfigError, "vtk or xyz or mdanalysis"),
     ],
 )
 def test_what_cannot_be_is_refused(overrides, error, match):
