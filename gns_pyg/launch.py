@@ -28,6 +28,9 @@ def launch(config_name: str, function: Callable[[DictConfig], Any]) -> None:
     os.environ["HYDRA_FULL_ERROR"] = "1"  # Hydra hands errors on; else it prints a traceback for each
     try:
         hydra.main(config_path=CONF, config_name=config_name, version_base="1.3")(job)()
+    except BrokenPipeError:  # the reader of --help has read enough
+        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+        sys.exit(1)
     except OSError as error:
         where = error.filename or "the run folder"
         sys.exit(f"StorageError: {StorageError(where, str(error), 'a file or folder that can be used', REMEDY)}")

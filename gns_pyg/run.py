@@ -33,6 +33,7 @@ from gns_pyg.evaluation.ensemble import roll_out_ensemble
 from gns_pyg.evaluation.judge import judge
 from gns_pyg.evaluation.metrics import strict, write_json
 from gns_pyg.evaluation.predict import start_frame, write_rollout
+from gns_pyg.report.loggers import close, log_report
 from gns_pyg.report.page import write_page
 from gns_pyg.report.plots import ensemble_spread, write_figure, write_plots
 from gns_pyg.report.table import ensemble_table, metrics_table
@@ -116,7 +117,8 @@ def train(cfg: DictConfig) -> dict[str, Any]:
     card["starts"] = [case.start() for case in (*cases.train, *cases.val)]
     bundle.save(folder / "bundle", trained, strict(card))
     unseen = [open_to_compare(case.path, scene, cfg.compare_every_s) for case in cases.test]
-    metrics = report(trained, unseen, expected, cfg, {"bundle": folder / "bundle"})
+    metrics = report(trained, unseen, expected, cfg, {"bundle": folder / "bundle"}, trainer)
+    close(trainer.loggers)
     bundle.save(folder / "bundle", trained, strict(card | {"metrics": metrics}))
     return metrics
 
@@ -320,9 +322,15 @@ def device(cfg: DictConfig) -> torch.device:
 
 
 def report(
-    simulator: Simulator, cases: list[Trajectory], expected: Climatology, cfg: DictConfig, places: dict[str, Path]
+    simulator: Simulator,
+    cases: list[Trajectory],
+    expected: Climatology,
+    cfg: DictConfig,
+    places: dict[str, Path],
+    trainer: pl.Trainer | None = None,
 ) -> dict[str, Any]:
-    """Judges a simulator on unseen cases; writes metrics.json, cases.json, plots and page; prints the table."""
+    """Judges a simulator on unseen cases; writes metrics.json, cases.json, plots and page; prints the table. The
+    loggers of the trainer that trained it get the same."""
     folder = Path(cfg.folder)
     if not cases:
         log.info("no unseen case, so nothing to judge the model by")
@@ -337,6 +345,8 @@ def report(
     write_json(folder / "metrics.json", metrics)
     write_json(folder / "cases.json", evaluation.per_case)
     figures = write_plots(evaluation, scene, folder / "plots")
+    if trainer is not None:
+        log_report(trainer.loggers, evaluation, scene, figures, folder, trainer.global_step)
     title = f"{scene.name}: {len(cases)} unseen cases from {cfg.start_s:g} s on"
     config = OmegaConf.to_yaml(cfg, resolve=True)
     write_page(folder / "report.html", title, metrics, figures, scene, config, versions(cases[0]))
