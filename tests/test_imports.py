@@ -18,6 +18,7 @@ BELOW["evaluation"] = {"evaluation", "bundle", "card"} | BELOW["data"]
 BELOW["training"] = {"training"} | BELOW["evaluation"]
 BELOW["report"] = {"report"} | BELOW["evaluation"]
 BELOW["results"] = {"results"} | BELOW["report"]
+BELOW["configuration"] = {"configuration", "training"} | BELOW["data"]
 BELOW["run"] = {*BELOW, "run"}
 BELOW["launch"] = {"config", "errors", "files"}
 BELOW["export"] = {"export", "launch"} | BELOW["report"]
