@@ -70,7 +70,8 @@ def _group(folder: Path) -> list[str]:
     record = RECORDS.get(folder.name)
     if record is Scene:
         for title, keys in _records(record, folder.name):
-            lines += [f"### {title}\n", *_table(("key", "default", "unit", "meaning"), [_row(*key) for key in keys])]
+            entries = [_row(*key) for key in keys]
+            lines += [f"### {title}\n", *_table(("key", "default", "unit", "meaning"), entries)]
     elif record is not None:
         heads = [path.stem for path in files]
         rows = []
@@ -81,8 +82,8 @@ def _group(folder: Path) -> list[str]:
         lines += _table(("key", *heads, "unit", "meaning"), rows)
     elif folder.name != "experiment":
         for path in files:
-            keys = [_row(f"{folder.name}.{key}", default, meaning) for key, default, meaning in _commented(path)]
-            lines += [f"### {folder.name}={path.stem}\n", *_table(("key", "default", "unit", "meaning"), keys)]
+            entries = [_row(f"{folder.name}.{key}", default, meaning) for key, default, meaning in _commented(path)]
+            lines += [f"### {folder.name}={path.stem}\n", *_table(("key", "default", "unit", "meaning"), entries)]
     else:
         lines += ["A whole study each; the first lines of a file are the command that runs it.\n"]
     return lines
