@@ -21,7 +21,7 @@ def stored(name):
 
 @pytest.mark.parametrize("name", sorted(path.name for path in bundle.SHIPPED.iterdir()))
 def test_a_shipped_card_is_what_the_code_writes(name):
-    """gns_pyg.results.write_pages(docs, results.json) writes them anew."""
+    """gns_pyg.results.rewrite_pages() writes them anew."""
     assert name in BUNDLES
     assert stored(name) == card_page(bundle.describe(name), JUDGED[name])
 
