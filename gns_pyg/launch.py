@@ -15,12 +15,19 @@ from gns_pyg.config import CONF
 from gns_pyg.errors import GnsError, StorageError
 from gns_pyg.files import REMEDY, held
 
+RANKS = ("RANK", "LOCAL_RANK", "SLURM_PROCID")  # as torchrun, Lightning and srun number their processes
+
+
+def rank() -> int:
+    """Number of this process among those that were started together; 0 alone."""
+    return next((int(os.environ[name]) for name in RANKS if name in os.environ), 0)
+
 
 def launch(config_name: str, function: Callable[[DictConfig], Any]) -> None:
     """Runs `function` on the composed config, once for every job; each holds its run folder meanwhile."""
 
     def job(cfg: DictConfig) -> Any:
-        if "folder" not in cfg or int(os.environ.get("LOCAL_RANK", 0)):  # started by Lightning: the first one holds it
+        if "folder" not in cfg or rank():  # of several processes that train together the first one holds it
             return function(cfg)
         with held(Path(cfg.folder)):
             return function(cfg)

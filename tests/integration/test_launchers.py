@@ -1,6 +1,7 @@
 """Sweeps through the launchers; submitit's local executor stands for Slurm, its other executor."""
 
 import json
+import os
 import shutil
 import subprocess
 import sys
@@ -11,6 +12,7 @@ from hydra import compose, initialize_config_dir
 
 from gns_pyg.config import CONF
 from gns_pyg.data.trajectory import Trajectory
+from gns_pyg.files import held
 
 ROOT = Path(__file__).parents[2]
 SWEEP = ["-m", "experiment=hopper", "training.updates=1", "start_s=1.15", "callbacks.rollout_metrics=null"]
@@ -66,3 +68,16 @@ def test_the_trainer_takes_lightning_s_keys_for_many_processes():
     with initialize_config_dir(CONF, version_base="1.3"):
         trainer = compose("train", ["trainer.devices=4", "trainer.num_nodes=2", "trainer.strategy=ddp"]).trainer
     assert (trainer.devices, trainer.num_nodes, trainer.strategy) == (4, 2, "ddp")
+
+
+@pytest.mark.parametrize(
+    ("variables", "says"),
+    [({}, "in use"), ({"SLURM_PROCID": "1"}, "radius_m"), ({"RANK": "4", "LOCAL_RANK": "0"}, "radius_m")],
+)
+def test_processes_that_srun_or_torchrun_start_share_the_first_one_s_folder(variables, says, tmp_path):
+    """The test holds the folder as the first process would; the config's error is what comes after the lock."""
+    words = [sys.executable, "train.py", "scene.grains.radius_m=-1", f"hydra.run.dir={tmp_path}"]
+    with held(tmp_path):
+        done = subprocess.run(words, cwd=ROOT, env=os.environ | variables, capture_output=True, text=True, check=False)
+    assert done.returncode == 1
+    assert says in done.stderr
