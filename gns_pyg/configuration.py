@@ -71,7 +71,7 @@ def _group(folder: Path) -> list[str]:
     if record is Scene:
         for title, keys in _records(record, folder.name):
             entries = [_row(*key) for key in keys]
-            lines += [f"### {title}\n", *_table(("key", "default", "unit", "meaning"), entries)]
+            lines += [f"### {_text(title)}\n", *_table(("key", "default", "unit", "meaning"), entries)]
     elif record is not None:
         heads = [path.stem for path in files]
         rows = []
@@ -177,7 +177,13 @@ def _shown(value: Any) -> str:
 
 def _table(heading: tuple[str, ...], rows: list[tuple[str, ...]]) -> list[str]:
     lines = [heading, ("---",) * len(heading), *rows]
-    return [f"| {' | '.join(cell.replace('|', chr(92) + '|') for cell in line)} |" for line in lines] + [""]
+    return [f"| {' | '.join(_text(cell) for cell in line)} |" for line in lines] + [""]
+
+
+def _text(cell: str) -> str:
+    """What Markdown shows as it is: no column ends within it, and `<name>` is no HTML but in code, where it never is."""
+    parts = cell.replace("|", "\\|").split("`")
+    return "`".join(part if index % 2 else part.replace("<", "&lt;") for index, part in enumerate(parts))
 
 
 if __name__ == "__main__":

@@ -39,6 +39,12 @@ def test_every_key_of_the_composed_config_is_on_the_page(app):
         assert ways & keys, key
 
 
+def test_what_stands_in_angle_brackets_is_shown():
+    assert "runs go to runs/&lt;name>/&lt;time>" in PAGE
+    assert "### scene.boundary.&lt;part>.motion" in PAGE
+    assert "`scene.boundary.<part>.motion.kind`" in PAGE
+
+
 def test_units_follow_from_the_keys():
     units = {row[0].removeprefix("| ").strip("`"): row[-2] for row in ROWS}
     assert units["scene.frame_dt_s"] == "s"
