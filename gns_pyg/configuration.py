@@ -181,7 +181,7 @@ def _table(heading: tuple[str, ...], rows: list[tuple[str, ...]]) -> list[str]:
 
 
 def _text(cell: str) -> str:
-    """What Markdown shows as it is: no column ends within it, and `<name>` is no HTML but in code, where it never is."""
+    """What Markdown shows as it is: no column ends within it, and `<name>` is HTML nowhere (in code it never is)."""
     parts = cell.replace("|", "\\|").split("`")
     return "`".join(part if index % 2 else part.replace("<", "&lt;") for index, part in enumerate(parts))
 
