@@ -141,5 +141,5 @@ def test_what_cannot_be_is_refused(overrides, error, match):
 def test_the_command_says_where_it_wrote_and_no_more(tmp_path):
     scenes.free_flight_case(tmp_path / "case.h5", n_frames=3)
     words = [sys.executable, "-m", "gns_pyg.export", f"trajectory={tmp_path / 'case.h5'}"]
-    done = subprocess.run(words, cwd=ROOT, capture_output=True, text=True, timeout=120, check=True)
+    done = subprocess.run(words, cwd=ROOT, capture_output=True, text=True, timeout=600, check=True)
     assert (done.stdout, done.stderr) == (f"{tmp_path / 'case.h5'} -> {tmp_path / 'case_vtk'}\n", "")
