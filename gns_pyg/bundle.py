@@ -1,4 +1,5 @@
-"""A trained simulator as one folder: weights.safetensors and bundle.json. Data only, nothing executable."""
+"""A trained simulator as one folder: weights.safetensors, bundle.json, and card.md, the same for a person. Data only,
+nothing executable."""
 
 import json
 from collections.abc import Mapping
@@ -12,6 +13,8 @@ from safetensors import SafetensorError
 from safetensors.torch import load_file, save_file
 from torch import Tensor, nn
 
+from gns_pyg.card import FILE as CARD
+from gns_pyg.card import card_page
 from gns_pyg.config import typed
 from gns_pyg.dynamics.model_config import ModelConfig
 from gns_pyg.dynamics.simulator import Simulator
@@ -62,6 +65,7 @@ def save(folder: str | Path, simulator: Simulator, card: Mapping[str, Any]) -> P
         except SafetensorError as error:  # an OSError in its clothes
             raise OSError(str(error)) from None
         (temporary / "bundle.json").write_text(json.dumps(description, indent=1))
+        (temporary / CARD).write_text(card_page(description), encoding="utf-8")
     return folder
 
 

@@ -1,5 +1,5 @@
-"""`make results`: judges the bundles that ship with the project and writes docs/results.json, docs/results.md and its
-pictures. Nothing in them is typed by hand."""
+"""`make results`: judges the bundles that ship with the project and writes docs/results.json, docs/results.md, its
+pictures and the bundles' cards. Nothing in them is typed by hand."""
 
 import json
 import logging
@@ -12,6 +12,8 @@ from typing import Any
 import numpy as np
 
 from gns_pyg import bundle, machine
+from gns_pyg.card import FILE as CARD
+from gns_pyg.card import card_page
 from gns_pyg.data.datamodule import EMBEDDED, find_cases, open_to_compare
 from gns_pyg.data.trajectory import Trajectory
 from gns_pyg.errors import DataError
@@ -31,6 +33,7 @@ BUNDLES = {  # what ships -> conditions it was never trained on
     "drum": ("drum_small_fuller", "drum_small_faster", "drum_small_smoother"),
     "inclined_drum": (),
 }
+DOCS = Path(__file__).parents[1] / "docs"
 START_S = 0.1
 MEMBERS = 16
 PICTURES = (
@@ -83,7 +86,7 @@ def results(docs: Path, names: Sequence[str] = tuple(BUNDLES)) -> dict[str, Any]
             "held_out": {condition: held_out(name, condition, expected) for condition in conditions},
         }
         write_json(path, found)
-    (docs / "results.md").write_text(results_page(strict(found)), encoding="utf-8")
+    write_pages(docs, strict(found))
     return found
 
 
@@ -102,6 +105,19 @@ def kept_for_testing(known: Mapping[str, Trajectory], card: Mapping[str, Any]) -
             found, remedy = f"no case of the hash {digest}", "fetch the data that the bundle was trained beside"
             raise DataError(file, found, "the run that the bundle kept for testing", remedy)
     return [known[digest] for digest in card["cases"]["test"].values()]
+
+
+def write_pages(docs: Path, found: Mapping[str, Any]) -> None:
+    """Writes what people read of the figures: results.md, and beside every judged bundle that ships its card."""
+    (docs / "results.md").write_text(results_page(found), encoding="utf-8")
+    for values in found.values():
+        page = card_page(bundle.describe(values["bundle"]), values["metrics"])
+        (bundle.SHIPPED / values["bundle"] / CARD).write_text(page, encoding="utf-8")
+
+
+def rewrite_pages(docs: Path = DOCS) -> None:
+    """Writes the pages again from results.json, judging nothing."""
+    write_pages(docs, json.loads((docs / "results.json").read_text()))
 
 
 def held_out(name: str, condition: str, expected: Climatology) -> dict[str, Any]:
@@ -168,4 +184,4 @@ def pictures(evaluation: Evaluation, scene: Scene, folder: Path, name: str) -> N
 
 if __name__ == "__main__":
     logging.basicConfig(level=logging.INFO, format="%(message)s")
-    results(Path(__file__).parents[1] / "docs", sys.argv[1:] or tuple(BUNDLES))
+    results(DOCS, sys.argv[1:] or tuple(BUNDLES))

@@ -38,6 +38,7 @@ from gns_pyg.evaluation.predict import start_frame, write_rollout
 from gns_pyg.evaluation.stress import Bench, Line, run_lines
 from gns_pyg.evaluation.stress_hard import HARD
 from gns_pyg.evaluation.stress_measured import MEASURED
+from gns_pyg.report.loggers import close, log_report
 from gns_pyg.report.page import Model, read_stability, write_page
 from gns_pyg.report.plots import ensemble_spread, write_figure, write_plots
 from gns_pyg.report.table import ensemble_table, metrics_table
@@ -124,7 +125,8 @@ def train(cfg: DictConfig) -> dict[str, Any]:
     card["starts"] = [case.start() for case in (*cases.train, *cases.val)]
     bundle.save(folder / "bundle", trained, strict(card))
     unseen = [open_to_compare(case.path, scene, cfg.compare_every_s) for case in cases.test]
-    metrics = judge_and_report(trained, unseen, expected, cfg, folder / "bundle", card)
+    metrics = judge_and_report(trained, unseen, expected, cfg, folder / "bundle", card, trainer)
+    close(trainer.loggers)
     bundle.save(folder / "bundle", trained, strict(card | {"metrics": metrics}))
     return metrics
 
@@ -385,13 +387,14 @@ def judge_and_report(
     cfg: DictConfig,
     bundle_name: str | Path,
     card: dict[str, Any],
+    trainer: pl.Trainer | None = None,
 ) -> dict[str, Any]:
     """Judges a simulator on unseen cases and reports it; without a case, an empty metrics.json."""
     if not cases:
         log.info("no unseen case, so nothing to judge the model by")
         write_json(Path(cfg.folder) / "metrics.json", {})
         return {}
-    return report(simulator, cases, judge(simulator, cases, expected, cfg.start_s), cfg, bundle_name, card)
+    return report(simulator, cases, judge(simulator, cases, expected, cfg.start_s), cfg, bundle_name, card, trainer)
 
 
 def report(
@@ -401,8 +404,10 @@ def report(
     cfg: DictConfig,
     bundle_name: str | Path,
     card: dict[str, Any],
+    trainer: pl.Trainer | None = None,
 ) -> dict[str, Any]:
-    """Writes what a simulator did on `cases`: metrics.json, cases.json, plots and page; prints the table."""
+    """Writes what a simulator did on `cases`: metrics.json, cases.json, plots and page; prints the table. The loggers
+    of the trainer that trained it get the same."""
     folder, bundle_folder = Path(cfg.folder), bundle.find(bundle_name)
     scene = replace(simulator.scene, frame_dt_s=cases[0].frame_dt_s)  # of what is compared
     metrics = evaluation.metrics | {
@@ -412,6 +417,8 @@ def report(
     write_json(folder / "metrics.json", metrics)
     write_json(folder / "cases.json", evaluation.per_case)
     figures = write_plots(evaluation, scene, folder / "plots")
+    if trainer is not None:
+        log_report(trainer.loggers, evaluation, scene, figures, folder, trainer.global_step)
     unseen = not any(seen(case, simulator.scene, card) for case in cases)
     names = ", ".join(case.path.stem for case in cases)
     what = f"{names} ({'unseen' if unseen else 'which the model was trained or validated on'})"

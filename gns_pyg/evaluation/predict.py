@@ -14,6 +14,7 @@ from typing import Any
 
 import numpy as np
 import torch
+from tqdm import tqdm
 
 from gns_pyg.config import require
 from gns_pyg.data.trajectory import Trajectory, TrajectoryWriter
@@ -196,7 +197,7 @@ def _run(simulator: Simulator, state: State, n_frames: int, steps: int, see: Cal
     states, seconds = rollout(step, state.to(simulator.scale.device), n_frames * steps, **options), 0.0
     if simulator.guard is not None:
         simulator.guard.reset()
-    for number in range(1, n_frames + 1):
+    for number in tqdm(range(1, n_frames + 1), desc="roll-out", unit="frame", leave=False, disable=None):
         begin = time.perf_counter()
         following = deque(islice(states, steps), maxlen=1)[0].to("cpu")
         seconds += time.perf_counter() - begin

@@ -204,14 +204,6 @@ def test_a_diverging_validation_roll_out_is_a_figure_not_a_crash(tmp_path, monke
     assert len(rows) == 2  # after updates 2 and 3
 
 
-@pytest.mark.parametrize("logger", ["wandb", "tensorboard"])
-def test_loggers_need_no_account(logger, tmp_path, monkeypatch):
-    monkeypatch.setenv("WANDB_MODE", "offline")
-    monkeypatch.setenv("WANDB_SILENT", "true")
-    train(tmp_path, "experiment=hopper", f"logger={logger}", "training.updates=1", "data.test_fraction=0")
-    assert (tmp_path / logger).is_dir(), list(tmp_path.iterdir())
-
-
 def command(*arguments):
     words = [sys.executable, *arguments]
     return subprocess.run(words, cwd=ROOT, capture_output=True, text=True, timeout=300, check=False)
