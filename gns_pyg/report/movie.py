@@ -12,7 +12,8 @@ from PIL import Image
 from gns_pyg.evaluation.metrics import CaseEvaluation
 from gns_pyg.evaluation.observables import finite_difference_velocity
 from gns_pyg.files import whole
-from gns_pyg.report.plots import SPEED_QUANTILE, _frame_of_view, _view, _wall_lines
+from gns_pyg.report.plots import frame_of_view, wall_lines
+from gns_pyg.report.view import COLOUR_QUANTILE, view
 from gns_pyg.scene.scene import Scene
 
 FRAMES, FRAME_MS = 40, 100
@@ -25,12 +26,12 @@ def write_movie(case: CaseEvaluation, scene: Scene, path: Path) -> Path:
         StorageError: if it cannot be written.
     """
     result = case.result
-    right, up, depth = _view(scene)
+    right, up, depth = view(scene)
     sides = {"DEM": result.dem_pos, "network": result.pos}
     speeds = [np.linalg.norm(finite_difference_velocity(pos, result.times_s), axis=2) for pos in sides.values()]
     known = speeds[0][np.isfinite(speeds[0])]
-    scale = Normalize(0.0, max(float(np.quantile(known, SPEED_QUANTILE)) if len(known) else 0.0, 1e-6))
-    (left, low), (edge, high) = _frame_of_view(case, scene, right, up)
+    scale = Normalize(0.0, max(float(np.quantile(known, COLOUR_QUANTILE)) if len(known) else 0.0, 1e-6))
+    (left, low), (edge, high) = frame_of_view(case, scene, right, up)
     tall = float(np.clip((high - low) / (edge - left), 0.5, 2.0))
     figure = Figure((6.4, 3.0 * tall + 0.5), dpi=80, layout="constrained")
     canvas = FigureCanvasAgg(figure)
@@ -46,7 +47,7 @@ def write_movie(case: CaseEvaluation, scene: Scene, path: Path) -> Path:
             grains = EllipseCollection(size, size, 0.0, units="xy", offsets=points, offset_transform=axes.transData)
             grains.set(array=speed[frame][order], norm=scale, cmap="viridis", edgecolor="0.15", linewidth=0.15)
             axes.add_collection(grains)
-            axes.add_collection(_wall_lines(scene, float(result.times_s[frame]), right, up, depth))
+            axes.add_collection(wall_lines(scene, float(result.times_s[frame]), right, up, depth))
             axes.set(xlim=(left, edge), ylim=(low, high), aspect="equal", xticks=[], yticks=[], title=name)
             axes.spines[:].set_visible(False)
         figure.suptitle(f"{scene.name}, {result.name}: t = {result.times_s[frame]:.2f} s", fontsize=10)

@@ -234,7 +234,7 @@ def snapshots(case: CaseEvaluation, scene: Scene, n_times: int = 4) -> Figure:
     known = np.concatenate([speed[np.isfinite(speed)] for speed in speeds.values()])
     fast = float(np.quantile(known, COLOUR_QUANTILE)) if len(known) else 0.0
     scale = Normalize(0.0, max(fast, 1e-6))
-    (left, low), (edge, high) = _frame_of_view(case, scene, right, up)
+    (left, low), (edge, high) = frame_of_view(case, scene, right, up)
     width = 2.3
     size = (width * len(frames) + 1.0, 2 * width * float(np.clip((high - low) / (edge - left), 0.5, 2.0)) + 0.9)
     figure = _bare_figure(size, "compressed")
@@ -251,7 +251,7 @@ def snapshots(case: CaseEvaluation, scene: Scene, n_times: int = 4) -> Figure:
             grains.set(array=speed[order], norm=scale, cmap="viridis", edgecolor="0.15", linewidth=0.15)
             grains.set_rasterized(True)  # thousands of circles would make an SVG of many megabytes
             axes.add_collection(grains)
-            axes.add_collection(_wall_lines(scene, float(result.times_s[frame]), right, up, depth))
+            axes.add_collection(wall_lines(scene, float(result.times_s[frame]), right, up, depth))
             axes.set(xlim=(left, edge), ylim=(low, high), aspect="equal", xticks=[], yticks=[])
             axes.spines[:].set_visible(False)
         row[0].set_ylabel(name, fontsize=11)
@@ -369,7 +369,7 @@ def _longest(evaluation: Evaluation) -> np.ndarray:
     return max((case.result.times_s for case in evaluation.cases), key=len)
 
 
-def _frame_of_view(case: CaseEvaluation, scene: Scene, right: np.ndarray, up: np.ndarray) -> np.ndarray:
+def frame_of_view(case: CaseEvaluation, scene: Scene, right: np.ndarray, up: np.ndarray) -> np.ndarray:
     """Corners (2, 2) of the view, with a margin: every place of the boundary, and DEM's grains where it does not hold
     them in."""
     pos, times_s = case.result.dem_pos, case.result.times_s
@@ -385,7 +385,7 @@ def _frame_of_view(case: CaseEvaluation, scene: Scene, right: np.ndarray, up: np
     return np.stack([points.min(axis=0) - margin, points.max(axis=0) + margin])
 
 
-def _wall_lines(scene: Scene, time_s: float, right: np.ndarray, up: np.ndarray, depth: np.ndarray) -> LineCollection:
+def wall_lines(scene: Scene, time_s: float, right: np.ndarray, up: np.ndarray, depth: np.ndarray) -> LineCollection:
     """Silhouette of every boundary part as it stands at `time_s`."""
     lines = []
     for name, part in scene.boundary.items():
