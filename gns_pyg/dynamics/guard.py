@@ -90,18 +90,21 @@ class PartGuard(nn.Module):
         super().__init__()
         self.name, self.motion = name, part.motion
         mesh = build_mesh(name, part)
-        mesh.update_faces(mesh.nondegenerate_faces())
-        inwards = -mesh.face_normals if mesh.is_watertight else mesh.face_normals
-        size = float(mesh.extents.max())
+        triangles = np.asarray(mesh.triangles)
+        across = np.cross(triangles[:, 1] - triangles[:, 0], triangles[:, 2] - triangles[:, 0])
+        size, twice_area = float(np.ptp(mesh.vertices, axis=0).max()), np.linalg.norm(across, axis=1)
+        thick = twice_area > (EDGE * size) ** 2  # one without an area stops nobody
+        triangles, normal = triangles[thick], across[thick] / twice_area[thick, None]
         self.tolerance_m = EDGE * size
-        offset = (inwards * mesh.triangles[:, 0]).sum(axis=1)
+        inwards = -normal if mesh.is_watertight else normal
+        offset = (inwards * triangles[:, 0]).sum(axis=1)
         planes = np.round(np.column_stack([inwards, offset / size]) / SAME_PLANE)
         _, index, plane = np.unique(planes, axis=0, return_index=True, return_inverse=True)
         order = np.argsort(plane.ravel(), kind="stable")
         held = {
             "normal": inwards[index],
             "offset": offset[index],
-            "corners": mesh.triangles[order],
+            "corners": triangles[order],
             "first": np.searchsorted(plane.ravel()[order], np.arange(len(index) + 1)),
         }
         for key, values in held.items():

@@ -136,3 +136,10 @@ def test_the_simulator_s_grains_stay_inside_whatever_its_networks_say(state_kind
     assert model.guard.crossings > 20
     if state_kind == "differences":
         torch.testing.assert_close(state.vel, (state.pos - before.pos) / scene.frame_dt_s)
+
+
+def test_a_floor_of_slivers_stops_grains_too():
+    floor = {"kind": "floor", "size_m": [0.2, 1e-5]}
+    guard = Guard(scenes.scene(1, 5, boundary={"floor": {"shape": floor, "points": 10, "friction_angle_rad": 0.5}}))
+    state = replace(simulators.state_in_box([1]), pos=torch.tensor([[0.05, 0.0, 0.01]]).double())
+    assert guard(state, step(state, torch.tensor([[0.0, 0.0, -0.1]]).double())).pos[0, 2] > 0
