@@ -1,5 +1,5 @@
 # make demo: the main job on the embedded real data.   make test: the tests.   make bench: the quick benchmarks' ratios.
-# make results: judges the shipped bundles, writes docs/results.md.
+# make results: judges the shipped bundles, writes docs/results.md.   make stability: the extremes (an hour or two), docs/stability.md.
 # All set up .venv first.
 # A plain Python package index serves torch's CUDA build for Linux (several GB). For the small CPU build:
 #   make demo TORCH_INDEX="--index-url https://download.pytorch.org/whl/cpu"
@@ -7,7 +7,7 @@ PYTHON ?= python3
 TORCH_INDEX ?=
 BIN = .venv/bin
 
-.PHONY: setup demo test bench results
+.PHONY: setup demo test bench results stability
 
 setup: .venv/.setup-done
 
@@ -30,6 +30,10 @@ test: setup
 
 results: setup
 	OMP_NUM_THREADS=1 $(BIN)/python -m gns_pyg.results
+
+stability: setup
+	for b in hopper drum inclined_drum; do OMP_NUM_THREADS=1 $(BIN)/python stress.py bundle=$$b hydra.run.dir=runs/stability/$$b || exit 1; done
+	$(BIN)/python -m gns_pyg.stability runs/stability docs
 
 bench: setup
 	OMP_NUM_THREADS=1 $(BIN)/python -m benchmarks

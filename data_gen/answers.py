@@ -52,7 +52,7 @@ def answers(cfg: DictConfig) -> dict[str, Any]:
     require(apart, "every", every, "at least 2", "an answer must lie between two states")
     state = simulator.requires.state
     require(state == "full", "bundle", f"a model of state {state}", "one of the full state", "the DEM needs all of it")
-    known = set(bundle.describe(cfg.bundle)["card"]["cases"]["train"].values())
+    known = set(bundle.card(cfg.bundle)["cases"]["train"].values())
     cases = [case for case in open_cases(simulator.scene, cfg.data.dir) if case.content_hash() in known]
     require(bool(cases), "data.dir", "none of the cases", "cases that the bundle was trained on", "name their folder")
     files, n_states = [], 0
@@ -75,7 +75,7 @@ def answers(cfg: DictConfig) -> dict[str, Any]:
 def own_states(simulator: Simulator, case: Trajectory, start: int, every: int) -> list[Start]:
     """States of a roll-out from the recorded frame `start`, every so many steps; if it diverges, those before."""
     state, found = initial_state(simulator, case, start), []
-    steps = rollout(simulator, state.to(simulator.scale.device), case.n_frames - 1 - start)
+    steps = rollout(simulator, state.to(simulator.scale.device), case.n_frames - 1 - start, settles=simulator.settles)
     try:
         for after in islice(steps, every - 1, None, every):
             now = after.to("cpu")

@@ -62,7 +62,6 @@ def run_dem(
             "apt-get install yade python3-h5py",
         )
     path = path.resolve()
-    clean_stale(path)
     with tempfile.TemporaryDirectory(prefix="gns_job_") as folder:
         job = {
             "scene": plain(scene),

@@ -19,6 +19,7 @@ from data_gen.initial import initial_state
 from gns_pyg.config import flat, plain, require
 from gns_pyg.data.trajectory import Trajectory
 from gns_pyg.errors import DataError
+from gns_pyg.files import held
 from gns_pyg.launch import launch
 from gns_pyg.scene.mesh import build_mesh, same_mesh
 from gns_pyg.scene.scene import Scene
@@ -27,7 +28,8 @@ READ_LATER = ("cases", "angle_of_repose", "state", "vary")  # keys that do not i
 
 
 def generate(config: DictConfig) -> Path:
-    """Generates the case that `config` describes unless its file is there already; returns the file's path.
+    """Generates the case that `config` describes unless its file is there already; returns the file's path. Several
+    processes may be told to: one generates it, the others wait for it.
 
     Raises:
         GnsError: for an impossible scene, a file from another scene, Yade missing or failing.
@@ -37,10 +39,17 @@ def generate(config: DictConfig) -> Path:
     require(config.cores >= 1, "cores", config.cores, "at least 1", "set cores=1")
     path = Path(config.out) / f"case_{config.case:03d}.h5"
     meshes = {name: build_mesh(name, part) for name, part in scene.boundary.items()}
-    if path.exists():
-        note = check_finished(path, scene, meshes)
-        say(f"{path}: already there, nothing to do{note}")
-        return path
+    if not path.exists():
+        with held(path.parent, config.case, waiting=lambda: say(f"{path}: another process generates it; waiting")):
+            if not path.exists():
+                make(path, scene, meshes, config)
+                return path
+    say(f"{path}: already there, nothing to do{check_finished(path, scene, meshes)}")
+    return path
+
+
+def make(path: Path, scene: Scene, meshes: Mapping[str, Trimesh], config: DictConfig) -> None:
+    """Runs the DEM and says how long it took."""
     start = initial_state(scene, meshes, config.case)
     progress = Progress(f"{scene.name} case {config.case:03d}")
     try:
@@ -50,7 +59,6 @@ def generate(config: DictConfig) -> Path:
     run = Trajectory(path).run
     rate = run["steps"] / max(run["wall_clock_s"], 1e-9)
     say(f"{path}: complete; {run['steps']} steps of {run['dt_s']:.3g} s in {run['wall_clock_s']:.1f} s ({rate:.0f}/s)")
-    return path
 
 
 def check_finished(path: Path, scene: Scene, meshes: Mapping[str, Trimesh]) -> str:

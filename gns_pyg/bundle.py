@@ -1,16 +1,20 @@
-"""A trained simulator as one folder: weights.safetensors and bundle.json. Data only, nothing executable."""
+"""A trained simulator as one folder: weights.safetensors, bundle.json, and card.md, the same for a person. Data only,
+nothing executable."""
 
 import json
 from collections.abc import Mapping
-from dataclasses import asdict, replace
+from dataclasses import asdict
 from pathlib import Path
-from typing import Any
+from typing import Any, cast
 
+import numpy as np
 import torch
 from safetensors import SafetensorError
 from safetensors.torch import load_file, save_file
 from torch import Tensor, nn
 
+from gns_pyg.card import FILE as CARD
+from gns_pyg.card import card_page
 from gns_pyg.config import typed
 from gns_pyg.dynamics.model_config import ModelConfig
 from gns_pyg.dynamics.simulator import Simulator
@@ -18,10 +22,11 @@ from gns_pyg.errors import BundleError
 from gns_pyg.files import whole
 from gns_pyg.models.statistics import Statistics
 from gns_pyg.scene.boundary_points import BoundaryPoints, boundary_points
-from gns_pyg.scene.requirements import Requirements, check_covers
+from gns_pyg.scene.requirements import Requirements, transferred
 from gns_pyg.scene.scene import Scene
 
 FORMAT_VERSION = 2
+FARTHEST_M = 1e6  # of a boundary point from the origin
 REMEDY = "copy the bundle again, or train again"
 SHIPPED = Path(__file__).parent / "bundles"
 
@@ -60,6 +65,7 @@ def save(folder: str | Path, simulator: Simulator, card: Mapping[str, Any]) -> P
         except SafetensorError as error:  # an OSError in its clothes
             raise OSError(str(error)) from None
         (temporary / "bundle.json").write_text(json.dumps(description, indent=1))
+        (temporary / CARD).write_text(card_page(description), encoding="utf-8")
     return folder
 
 
@@ -85,6 +91,37 @@ def describe(folder: str | Path) -> dict[str, Any]:
     return description
 
 
+def card(folder: str | Path) -> dict[str, Any]:
+    """What a trained bundle was trained on and how good it is; `save` takes it, `run.train` writes it.
+
+    Raises:
+        BundleError: if something in it has not the shape that judging and rolling out rely on.
+    """
+    path, found = find(folder) / "bundle.json", cast(dict[str, Any], describe(folder).get("card"))
+    try:
+        hashes = [digest for purpose in ("train", "val", "test") for digest in found["cases"][purpose].values()]
+        curves = {key: np.array(curve, float) for key, curve in found["climatology"].items() if curve is not None}
+        n_frames = len(curves["times_s"])
+        shapes = {key: (n_frames, 3) if key == "center_of_mass_m" else (n_frames,) for key in curves}
+        sound = {
+            "cases": all(isinstance(digest, str) for digest in hashes),
+            "climatology": all(curves[key].shape == shape for key, shape in shapes.items())
+            and found["climatology"].keys() == {"times_s", "center_of_mass_m", "angle_of_repose_deg", "outflow"}
+            and {"times_s", "center_of_mass_m"} <= curves.keys(),
+            "coverage": all(
+                len(limits) == 2 and all(type(limit) in (int, float) for limit in limits)
+                for limits in found["coverage"].values()
+            ),
+            "starts": all(np.array(start, float).shape[1:] == (3,) for start in found.get("starts", [])),
+        }
+        wrong = ", ".join(f"card.{key}" for key, holds in sound.items() if not holds)
+    except (KeyError, TypeError, ValueError, AttributeError, OverflowError) as error:
+        wrong = f"card: {type(error).__name__}: {error}"
+    if wrong:
+        raise BundleError(path, wrong, "a card as train.py writes it", REMEDY)
+    return found
+
+
 def load(folder: str | Path, scene: Scene | None = None) -> Simulator:
     """Rebuilds the simulator of a bundle, in evaluation mode, on the CPU.
 
@@ -108,12 +145,13 @@ def load(folder: str | Path, scene: Scene | None = None) -> Simulator:
         if scene is None:
             points = {name: _points(path, weights, part) for part, name in enumerate(own.boundary)}
         else:
-            check_covers(requires, scene)
-            requires = replace(requires, active_mask=scene.outlet is not None or scene.inlet is not None)
+            requires = transferred(requires, own, scene)
             points = boundary_points(scene, model.cutoff_wall_radii)
             weights = {key: value for key, value in weights.items() if not key.startswith("boundary.")}
         statistics = typed(Statistics, description.get("statistics"), "statistics")
         simulator = Simulator(scene or own, model, requires, points, statistics)
+        if len(simulator.scale) != 3 * (groups := simulator.integrator.n_groups):
+            raise BundleError(path.with_name("bundle.json"), f"{statistics}", f"{groups} scales of corrections", REMEDY)
         if scene is not None:
             weights |= {f"boundary.{k}": v for k, v in (simulator.boundary or nn.Module()).state_dict().items()}
         simulator.load_state_dict(weights)
@@ -139,4 +177,6 @@ def _points(path: Path, weights: Mapping[str, Tensor], part: int) -> BoundaryPoi
     if pos.ndim != 2 or pos.shape[1] != 3 or pos.shape != normal.shape or not len(pos):
         found = f"boundary points {tuple(pos.shape)} with normals {tuple(normal.shape)}"
         raise BundleError(path, found, "(n, 3) of each", REMEDY)
+    if pos.abs().max() > FARTHEST_M or normal.abs().max() > 1 + 1e-6:
+        raise BundleError(path, "boundary points too far away, or normals too long", "metres; at most 1", REMEDY)
     return BoundaryPoints(pos.numpy(), normal.numpy())

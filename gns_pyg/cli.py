@@ -32,3 +32,8 @@ def tradeoff() -> None:
         launch("recommend", recommend, configs)
     else:
         launch("tradeoff", app.tradeoff, configs)
+
+
+def stress() -> None:
+    """gns-stress"""
+    launch("stress", run.stress)

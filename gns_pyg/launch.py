@@ -1,8 +1,10 @@
 """Starts a command: a Hydra app that ends with a message and status 1, no traceback, where a user can act on it."""
 
 import os
+import signal
 import sys
 from collections.abc import Callable
+from contextlib import suppress
 from pathlib import Path
 from typing import Any
 
@@ -15,13 +17,22 @@ from gns_pyg.config import CONF
 from gns_pyg.errors import GnsError, StorageError
 from gns_pyg.files import REMEDY, held
 
+RANKS = ("RANK", "LOCAL_RANK", "SLURM_PROCID")  # as torchrun, Lightning and srun number their processes
+
+
+def rank() -> int:
+    """Number of this process among those that were started together; 0 alone."""
+    return next((int(os.environ[name]) for name in RANKS if name in os.environ), 0)
+
 
 def launch(config_name: str, function: Callable[[DictConfig], Any], configs: str = CONF) -> None:
     """Runs `function` on the composed config of the folder `configs`, once for every job; each holds its run folder
     meanwhile."""
 
     def job(cfg: DictConfig) -> Any:
-        if "folder" not in cfg or int(os.environ.get("LOCAL_RANK", 0)):  # started by Lightning: the first one holds it
+        with suppress(ValueError):  # a launcher that runs jobs in threads
+            signal.signal(signal.SIGTERM, signal.default_int_handler)  # what a cluster sends: end as on Ctrl-C
+        if "folder" not in cfg or rank():  # of several processes that train together the first one holds it
             return function(cfg)
         with held(Path(cfg.folder)):
             return function(cfg)
@@ -29,6 +40,9 @@ def launch(config_name: str, function: Callable[[DictConfig], Any], configs: str
     os.environ["HYDRA_FULL_ERROR"] = "1"  # Hydra hands errors on; else it prints a traceback for each
     try:
         hydra.main(config_path=configs, config_name=config_name, version_base="1.3")(job)()
+    except BrokenPipeError:  # the reader of --help has read enough
+        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+        sys.exit(1)
     except OSError as error:
         where = error.filename or "the run folder"
         sys.exit(f"StorageError: {StorageError(where, str(error), 'a file or folder that can be used', REMEDY)}")

@@ -1,5 +1,5 @@
-"""`make results`: judges the bundles that ship with the project and writes docs/results.json, docs/results.md and its
-pictures. Nothing in them is typed by hand."""
+"""`make results`: judges the bundles that ship with the project and writes docs/results.json, docs/results.md, its
+pictures and the bundles' cards. Nothing in them is typed by hand."""
 
 import json
 import logging
@@ -12,8 +12,11 @@ from typing import Any
 import numpy as np
 
 from gns_pyg import bundle, machine
+from gns_pyg.card import FILE as CARD
+from gns_pyg.card import card_page
 from gns_pyg.data.datamodule import EMBEDDED, find_cases, open_to_compare
 from gns_pyg.data.trajectory import Trajectory
+from gns_pyg.errors import DataError
 from gns_pyg.evaluation.baselines import Climatology
 from gns_pyg.evaluation.ensemble import curves, roll_out_ensemble
 from gns_pyg.evaluation.errors import nanmean, positions
@@ -30,6 +33,7 @@ BUNDLES = {  # what ships -> conditions it was never trained on
     "drum": ("drum_small_fuller", "drum_small_faster", "drum_small_smoother"),
     "inclined_drum": (),
 }
+DOCS = Path(__file__).parents[1] / "docs"
 START_S = 0.1
 MEMBERS = 16
 PICTURES = (
@@ -60,10 +64,10 @@ def results(docs: Path, names: Sequence[str] = tuple(BUNDLES)) -> dict[str, Any]
     found: dict[str, Any] = json.loads(path.read_text()) if path.exists() else {}
     for name in names:
         conditions = BUNDLES[name]
-        simulator, card = bundle.load(name), bundle.describe(name)["card"]
+        simulator, card = bundle.load(name), bundle.card(name)
         scene, expected = simulator.scene, Climatology.from_plain(card["climatology"])
-        known = {path.name: open_to_compare(path, scene) for path in find_cases(scene, str(EMBEDDED / scene.name))}
-        unseen = [known[file] for file in card["cases"]["test"]]
+        known = {case.content_hash(): case for case in open_embedded(scene)}
+        unseen = kept_for_testing(known, card)
         log.info("%s: %d unseen cases", name, len(unseen))
         evaluation = judge(simulator, unseen, expected, START_S)
         pictures(evaluation, replace(scene, frame_dt_s=unseen[0].frame_dt_s), docs / "figures", name)
@@ -82,8 +86,38 @@ def results(docs: Path, names: Sequence[str] = tuple(BUNDLES)) -> dict[str, Any]
             "held_out": {condition: held_out(name, condition, expected) for condition in conditions},
         }
         write_json(path, found)
-    (docs / "results.md").write_text(results_page(strict(found)), encoding="utf-8")
+    write_pages(docs, strict(found))
     return found
+
+
+def open_embedded(scene: Scene) -> list[Trajectory]:
+    return [open_to_compare(path, scene) for path in find_cases(scene, str(EMBEDDED / scene.name))]
+
+
+def kept_for_testing(known: Mapping[str, Trajectory], card: Mapping[str, Any]) -> list[Trajectory]:
+    """The cases (content hash -> case) that a bundle kept for testing.
+
+    Raises:
+        DataError: if one of them is not there: figures of other data must not stand in its place.
+    """
+    for file, digest in card["cases"]["test"].items():
+        if digest not in known:
+            found, remedy = f"no case of the hash {digest}", "fetch the data that the bundle was trained beside"
+            raise DataError(file, found, "the run that the bundle kept for testing", remedy)
+    return [known[digest] for digest in card["cases"]["test"].values()]
+
+
+def write_pages(docs: Path, found: Mapping[str, Any]) -> None:
+    """Writes what people read of the figures: results.md, and beside every judged bundle that ships its card."""
+    (docs / "results.md").write_text(results_page(found), encoding="utf-8")
+    for values in found.values():
+        page = card_page(bundle.describe(values["bundle"]), values["metrics"])
+        (bundle.SHIPPED / values["bundle"] / CARD).write_text(page, encoding="utf-8")
+
+
+def rewrite_pages(docs: Path = DOCS) -> None:
+    """Writes the pages again from results.json, judging nothing."""
+    write_pages(docs, json.loads((docs / "results.json").read_text()))
 
 
 def held_out(name: str, condition: str, expected: Climatology) -> dict[str, Any]:
@@ -150,4 +184,4 @@ def pictures(evaluation: Evaluation, scene: Scene, folder: Path, name: str) -> N
 
 if __name__ == "__main__":
     logging.basicConfig(level=logging.INFO, format="%(message)s")
-    results(Path(__file__).parents[1] / "docs", sys.argv[1:] or tuple(BUNDLES))
+    results(DOCS, sys.argv[1:] or tuple(BUNDLES))

@@ -14,6 +14,7 @@ import torch
 from hydra.errors import InstantiationException
 from hydra.utils import instantiate
 from omegaconf import DictConfig, OmegaConf
+from pytorch_lightning.callbacks import Timer
 from pytorch_lightning.utilities.exceptions import MisconfigurationException
 from pytorch_lightning.utilities.rank_zero import rank_zero_only
 
@@ -27,15 +28,21 @@ from gns_pyg.dynamics.execution import Execution
 from gns_pyg.dynamics.integrator import Integrator
 from gns_pyg.dynamics.model_config import ModelConfig
 from gns_pyg.dynamics.simulator import Simulator
-from gns_pyg.errors import CheckpointError, ConfigError, GnsError
+from gns_pyg.errors import CheckpointError, ConfigError, GnsError, NumericalError
 from gns_pyg.evaluation.baselines import Climatology, climatology
 from gns_pyg.evaluation.ensemble import roll_out_ensemble
-from gns_pyg.evaluation.judge import judge
-from gns_pyg.evaluation.metrics import strict, write_json
+from gns_pyg.evaluation.errors import positions
+from gns_pyg.evaluation.judge import judge, judge_rollout
+from gns_pyg.evaluation.metrics import Evaluation, dem_seconds, evaluate_cases, strict, write_json
 from gns_pyg.evaluation.predict import start_frame, write_rollout
-from gns_pyg.report.page import write_page
+from gns_pyg.evaluation.stress import Bench, Line, run_lines
+from gns_pyg.evaluation.stress_hard import HARD
+from gns_pyg.evaluation.stress_measured import MEASURED
+from gns_pyg.report.loggers import close, log_report
+from gns_pyg.report.page import Model, read_stability, write_page
 from gns_pyg.report.plots import ensemble_spread, write_figure, write_plots
 from gns_pyg.report.table import ensemble_table, metrics_table
+from gns_pyg.report.verdict import draw_verdict, mark, verdict_table
 from gns_pyg.scene.boundary_points import boundary_points
 from gns_pyg.scene.requirements import Requirements, Requires, resolve
 from gns_pyg.scene.scene import Scene
@@ -62,19 +69,20 @@ def train(cfg: DictConfig) -> dict[str, Any]:
     folder, done = Path(cfg.folder), trained(cfg)
     if done is None:  # the first process judges and writes
         return {}
-    simulator, cases, expected, card = done
+    simulator, cases, expected, card, trainer = done
     unseen = [open_to_compare(case.path, simulator.scene, cfg.compare_every_s) for case in cases.test]
-    metrics = report(simulator, unseen, expected, cfg, {"bundle": folder / "bundle"})
+    metrics = judge_and_report(simulator, unseen, expected, cfg, folder / "bundle", card, trainer)
+    close(trainer.loggers)
     bundle.save(folder / "bundle", simulator, strict(card | {"metrics": metrics}))
     return metrics
 
 
-def trained(cfg: DictConfig) -> tuple[Simulator, Split, Climatology, dict[str, Any]] | None:
+def trained(cfg: DictConfig) -> tuple[Simulator, Split, Climatology, dict[str, Any], pl.Trainer] | None:
     """Trains and saves a bundle, unjudged.
 
     Returns:
-        The simulator, the cases, the training cases' mean curves and the bundle's card; None in all processes but the
-        first.
+        The simulator, the cases, the training cases' mean curves, the bundle's card and the trainer; None in all
+        processes but the first.
     """
     check_keys(cfg, TRAIN_KEYS)
     folder, where = Path(cfg.folder), device(cfg)
@@ -121,7 +129,8 @@ def trained(cfg: DictConfig) -> tuple[Simulator, Split, Climatology, dict[str, A
         log.info("going on from %s", last)
         resume_from = str(last)
     set_log_aside(folder)
-    trainer = build_trainer(cfg, training, where)
+    timer = Timer()  # its time is part of a checkpoint: a resumed run goes on counting
+    trainer = build_trainer(cfg, training, where, timer)
     fit(trainer, module, datamodule, resume_from)
     trainer.save_checkpoint(folder / "checkpoints" / "last.ckpt")
     if not trainer.is_global_zero:
@@ -129,10 +138,11 @@ def trained(cfg: DictConfig) -> tuple[Simulator, Split, Climatology, dict[str, A
     simulator = module.judged.eval().to(where)
     expected = climatology(cases.train, scene)
     card = {"cases": used, "training": plain(cfg.training), "climatology": asdict(expected)}
+    card["cost"] = cost(cases, training, timer.time_elapsed("train"), where)
     card["coverage"] = coverage(scene, cases.train)
     card["starts"] = [case.start() for case in (*cases.train, *cases.val)]
     bundle.save(folder / "bundle", simulator, strict(card))
-    return simulator, cases, expected, card
+    return simulator, cases, expected, card, trainer
 
 
 def evaluate(cfg: DictConfig) -> dict[str, Any]:
@@ -140,16 +150,17 @@ def evaluate(cfg: DictConfig) -> dict[str, Any]:
 
     With `scene` that scene's cases are taken and simulated instead: transfer without training.
     """
-    simulator, card = load_bundle(cfg), bundle.describe(cfg.bundle)["card"]
+    simulator, card = load_bundle(cfg), bundle.card(cfg.bundle)
     cases = unseen_cases(simulator.scene, cfg.data.dir, card, cfg.compare_every_s)
     for case in cases:
         warn_outside(simulator.scene, case, start_frame(case, cfg.start_s), card)
-    return report(simulator, cases, Climatology.from_plain(card["climatology"]), cfg, {})
+    return judge_and_report(simulator, cases, Climatology.from_plain(card["climatology"]), cfg, cfg.bundle, card)
 
 
 def rollout(cfg: DictConfig) -> dict[str, Any]:
-    """Rolls a bundle out from a recorded case and writes the trajectory in the data's own format."""
-    simulator, card = load_bundle(cfg), bundle.describe(cfg.bundle)["card"]
+    """Rolls a bundle out from a recorded case, writes the trajectory in the data's own format, and compares it with the
+    recorded case."""
+    simulator, card = load_bundle(cfg), bundle.card(cfg.bundle)
     if cfg.trajectory is None:
         unseen = unseen_cases(simulator.scene, None, card, None)
         require(
@@ -159,13 +170,61 @@ def rollout(cfg: DictConfig) -> dict[str, Any]:
         log.info("from the unseen case %s", trajectory.path)
     else:
         trajectory = open_to_compare(cfg.trajectory, simulator.scene)
+        if seen(trajectory, simulator.scene, card):
+            log.warning("%s: the bundle was trained or validated on this case", trajectory.path.name)
     path, start = Path(cfg.folder) / "rollout.h5", start_frame(trajectory, cfg.start_s)
     warn_outside(simulator.scene, trajectory, start, card)
     if cfg.ensemble is not None:
         return roll_out_members(simulator, trajectory, start, cfg)
     seconds = write_rollout(simulator, trajectory, start, path)
     log.info("%.3g s per simulated second -> %s", seconds, path)
-    return {"rollout": str(path), "speed/seconds_per_simulated_second": seconds}
+    result = judge_rollout(simulator, trajectory, start, positions(Trajectory(path)), seconds)
+    evaluation = evaluate_cases([result], Climatology.from_plain(card["climatology"]), simulator.scene)
+    return {"rollout": str(path)} | report(simulator, [trajectory], evaluation, cfg, cfg.bundle, card)
+
+
+def stress(cfg: DictConfig) -> dict[str, Any]:
+    """Puts a bundle, or an untrained model, through the extremes; writes stability.json and a picture.
+
+    Returns:
+        `lines`: the verdict (see `evaluation.stress.Line`), as in stability.json.
+
+    Raises:
+        NumericalError: if a hard line does not hold; names them. Everything is written before.
+    """
+    folder, forms = Path(cfg.folder), ("full", "short")
+    require(cfg.form in forms, "form", cfg.form, " or ".join(forms), "short is what the tests run")
+    if cfg.bundle == "untrained":
+        require(cfg.get("scene") is not None, "scene", None, "a scene", "e.g. scene=hopper_small")
+        scene = Scene.from_config(cfg.scene)
+        cases, training = split(scene, DataConfig(dir=cfg.data.dir)), typed(TrainingConfig, cfg.training, "training")
+        requires = resolve(scene, values(cases.train), typed(Requires, cfg.requires, "requires"))
+        simulator = build(scene, typed(ModelConfig, cfg.model, "model"), requires, cases, training).eval()
+        case, covered = (cases.test or cases.train)[0], {}
+    else:
+        named, remedy = cfg.bundle is not None, "bundle=runs/.../bundle, as train.py prints it"
+        require(named, "bundle", "null", "a bundle folder or untrained", remedy)
+        simulator, card = bundle.load(cfg.bundle), bundle.describe(cfg.bundle)["card"]
+        unseen = unseen_cases(simulator.scene, cfg.data.dir, card, None)
+        require(bool(unseen), "data.dir", cfg.data.dir, "a case that the bundle has not seen", "generate one more")
+        case, covered = unseen[0], card["coverage"]
+    bench = Bench(simulator, case, covered, cfg.form == "full", cfg.start_s)
+    lines: list[Line] = []
+    for registry, hard in ((HARD, True), (MEASURED, False)):
+        for line in run_lines(bench, registry, hard, [str(text) for text in cfg.lines]):
+            log.info("%s: %s (%.0f s)", line.line, mark(line), line.seconds)
+            lines.append(line)
+    found = {"bundle": str(cfg.bundle), "scene": simulator.scene.name, "form": cfg.form}
+    found |= {"processor": machine.processor(), "lines": [line.plain() for line in lines], "curves": bench.curves}
+    write_json(folder / "stability.json", found)
+    title = f"{cfg.bundle}: {simulator.scene.name} at the extremes"
+    write_figure(draw_verdict(bench.curves, title), folder / "plots" / "stability")
+    log.info("\n%s", verdict_table(lines, title, {"run folder": folder, "picture": folder / "plots/stability.png"}))
+    failed = [line.line for line in lines if line.holds is False]
+    if failed:
+        remedy = "see stability.json for what was found; docs/stability.md says what helps"
+        raise NumericalError("hard lines", "; ".join(failed), "all of them hold", remedy)
+    return found
 
 
 def roll_out_members(simulator: Simulator, case: Trajectory, start: int, cfg: DictConfig) -> dict[str, Any]:
@@ -183,17 +242,18 @@ def roll_out_members(simulator: Simulator, case: Trajectory, start: int, cfg: Di
 def unseen_cases(scene: Scene, folder: str | None, card: dict[str, Any], every_s: float | None) -> list[Trajectory]:
     """The cases of a scene (see `open_to_compare`) that a bundle was neither trained nor validated on: neither their
     content nor, however they were recorded, their start is that of one that it was."""
-    seen = {digest for purpose in ("train", "val") for digest in card["cases"][purpose].values()}
+    cases = [open_to_compare(path, scene, every_s) for path in find_cases(scene, folder)]
+    return [case for case in cases if not seen(case, scene, card)]
+
+
+def seen(case: Trajectory, scene: Scene, card: dict[str, Any]) -> bool:
+    """Whether a bundle was trained or validated on a case."""
+    digests = {digest for purpose in ("train", "val") for digest in card["cases"][purpose].values()}
     starts = [np.array(start) for start in card.get("starts", [])]  # bundles made before have none
     within_m = SAME_START * scene.grains.radii_m[0]
-
-    def known(case: Trajectory) -> bool:
-        own = case.start()
-        same = (own.shape == start.shape and np.abs(own - start).max() < within_m for start in starts)
-        return case.content_hash() in seen or any(same)
-
-    cases = [open_to_compare(path, scene, every_s) for path in find_cases(scene, folder)]
-    return [case for case in cases if not known(case)]
+    own = case.start()
+    same = (own.shape == start.shape and np.abs(own - start).max() < within_m for start in starts)
+    return case.content_hash() in digests or any(same)
 
 
 def warn_outside(scene: Scene, case: Trajectory, start: int, card: dict[str, Any]) -> None:
@@ -242,8 +302,8 @@ def build(
     return simulator
 
 
-def build_trainer(cfg: DictConfig, training: TrainingConfig, where: torch.device) -> pl.Trainer:
-    """Lightning's trainer with the config's loggers and callbacks.
+def build_trainer(cfg: DictConfig, training: TrainingConfig, where: torch.device, timer: Timer) -> pl.Trainer:
+    """Lightning's trainer with the config's loggers and callbacks, and a timer.
 
     Raises:
         ConfigError: for keys or values under trainer, logger or callbacks that cannot be built.
@@ -252,6 +312,7 @@ def build_trainer(cfg: DictConfig, training: TrainingConfig, where: torch.device
         logging.getLogger(name).setLevel(logging.WARNING)
     warnings.filterwarnings("ignore", message=".*treespec, LeafSpec.*")
     warnings.filterwarnings("ignore", message=".*does not have many workers.*")
+    warnings.filterwarnings("ignore", message=".*exists and is not empty.*")  # a run that goes on
     try:
         trainer = pl.Trainer(
             **plain(cfg.trainer),
@@ -259,7 +320,7 @@ def build_trainer(cfg: DictConfig, training: TrainingConfig, where: torch.device
             max_steps=training.updates,
             gradient_clip_val=training.gradient_clip or None,
             logger=instantiate(cfg.logger),
-            callbacks=[instantiate(callback) for callback in cfg.callbacks.values() if callback is not None],
+            callbacks=[timer, *(instantiate(callback) for callback in cfg.callbacks.values() if callback is not None)],
             default_root_dir=cfg.folder,
             plugins=[Checkpoints()],
             use_distributed_sampler=False,  # UpdateSampler divides batches itself
@@ -337,17 +398,36 @@ def device(cfg: DictConfig) -> torch.device:
     return torch.device("cuda" if cuda and cfg.device != "cpu" else "cpu")
 
 
-def report(
-    simulator: Simulator, cases: list[Trajectory], expected: Climatology, cfg: DictConfig, places: dict[str, Path]
+def judge_and_report(
+    simulator: Simulator,
+    cases: list[Trajectory],
+    expected: Climatology,
+    cfg: DictConfig,
+    bundle_name: str | Path,
+    card: dict[str, Any],
+    trainer: pl.Trainer | None = None,
 ) -> dict[str, Any]:
-    """Judges a simulator on unseen cases; writes metrics.json, cases.json, plots and page; prints the table."""
-    folder = Path(cfg.folder)
+    """Judges a simulator on unseen cases and reports it; without a case, an empty metrics.json."""
     if not cases:
         log.info("no unseen case, so nothing to judge the model by")
-        write_json(folder / "metrics.json", {})
+        write_json(Path(cfg.folder) / "metrics.json", {})
         return {}
+    return report(simulator, cases, judge(simulator, cases, expected, cfg.start_s), cfg, bundle_name, card, trainer)
+
+
+def report(
+    simulator: Simulator,
+    cases: list[Trajectory],
+    evaluation: Evaluation,
+    cfg: DictConfig,
+    bundle_name: str | Path,
+    card: dict[str, Any],
+    trainer: pl.Trainer | None = None,
+) -> dict[str, Any]:
+    """Writes what a simulator did on `cases`: metrics.json, cases.json, plots and page; prints the table. The loggers
+    of the trainer that trained it get the same."""
+    folder, bundle_folder = Path(cfg.folder), bundle.find(bundle_name)
     scene = replace(simulator.scene, frame_dt_s=cases[0].frame_dt_s)  # of what is compared
-    evaluation = judge(simulator, cases, expected, cfg.start_s)
     metrics = evaluation.metrics | {
         "speed/threads": torch.get_num_threads(),
         "speed/device": device_name(simulator.scale.device),
@@ -355,12 +435,32 @@ def report(
     write_json(folder / "metrics.json", metrics)
     write_json(folder / "cases.json", evaluation.per_case)
     figures = write_plots(evaluation, scene, folder / "plots")
-    title = f"{scene.name}: {len(cases)} unseen cases from {cfg.start_s:g} s on"
+    if trainer is not None:
+        log_report(trainer.loggers, evaluation, scene, figures, folder, trainer.global_step)
+    unseen = not any(seen(case, simulator.scene, card) for case in cases)
+    names = ", ".join(case.path.stem for case in cases)
+    what = f"{names} ({'unseen' if unseen else 'which the model was trained or validated on'})"
+    title = f"{scene.name}: {what} from {cfg.start_s:g} s on"
+    model = Model(str(bundle_name), simulator.requires, card, read_stability(bundle_folder, card))
+    page = folder / "report.html"
     config = OmegaConf.to_yaml(cfg, resolve=True)
-    write_page(folder / "report.html", title, metrics, figures, scene, config, versions(cases[0]))
-    places = {"run folder": folder, **places, "plots": folder / "plots", "report": folder / "report.html"}
+    write_page(page, title, metrics, figures, evaluation.cases[0].result, scene, model, config, versions(cases[0]))
+    places = {"run folder": folder, "bundle": bundle_folder, "plots": folder / "plots", "report": page}
     log.info("\n%s", metrics_table(metrics, title, places))
     return metrics
+
+
+def cost(cases: Split, training: TrainingConfig, seconds: float, where: torch.device) -> dict[str, Any]:
+    """What a bundle has cost: Yade for all it learned from, s, and training, wall s (None where the bundle that it
+    started from does not say)."""
+    start = training.start_from and bundle.describe(training.start_from)["card"].get("cost", {"training_s": None})
+    earlier = start["training_s"] if start else 0.0
+    learned = (*cases.train, *cases.val, *cases.answers)
+    return {
+        "dem_s": sum(dem_seconds(case.run) for case in learned),
+        "training_s": None if earlier is None else earlier + seconds,
+        "training_device": device_name(where),
+    }
 
 
 def device_name(where: torch.device) -> str:

@@ -11,7 +11,8 @@ from gns_pyg.scene.mesh import build_mesh
 from gns_pyg.scene.motion import to_world
 from gns_pyg.scene.scene import PARAMETERS, Scene
 
-SPEEDS = ("grain speed, m/s", "angular speed, rad/s", "wall speed, m/s")  # an upper limit counts, with some room
+SPEEDS = ("grain speed, m/s", "angular speed, rad/s")  # an upper limit counts, with some room
+WALLS = "wall speed, m/s"  # of each part's fastest corner; both limits count, with some room
 ROOM, SLACK = 1.2, 0.01
 
 
@@ -41,7 +42,8 @@ def coverage(scene: Scene, trajectories: Sequence[Trajectory], frames: slice = s
     for name, field in zip(SPEEDS, ("velocity", "angular_velocity"), strict=False):
         fastest = [np.linalg.norm(t.read(field, frames.start or 0, frames.stop), axis=2).max() for t in trajectories]
         ranges[name] = [0.0, float(max(fastest))]
-    ranges["wall speed, m/s"] = [0.0, max([0.0, *map(float, _wall_speeds(scene))])]
+    fastest_walls = _wall_speeds(scene) or [0.0]
+    ranges[WALLS] = [min(fastest_walls), max(fastest_walls)]
     return ranges
 
 
@@ -54,22 +56,25 @@ def outside_coverage(trained: Mapping[str, Sequence[float]], now: Mapping[str, S
             continue
         lowest, highest = trained[name]
         slack = SLACK * max(abs(lowest), abs(highest)) + 1e-9
-        too_high = high > (ROOM * highest + 1e-9 if name in SPEEDS else highest + slack)
-        if too_high or (name not in SPEEDS and low < lowest - slack):
+        too_high = high > (ROOM * highest + 1e-9 if name in (*SPEEDS, WALLS) else highest + slack)
+        too_low = name not in SPEEDS and low < (lowest / ROOM - 1e-9 if name == WALLS else lowest - slack)
+        if too_high or too_low:
             shown = f"{high:.4g}" if too_high else f"{low:.4g}"
             seen = f"{highest:.4g}" if lowest == highest else f"{lowest:.4g} to {highest:.4g}"
             texts.append(f"{name}: {shown}; the model has seen {seen}")
     return texts
 
 
-def _wall_speeds(scene: Scene) -> list[torch.Tensor]:
-    """Highest speed of each moving part's corners at the scene's frames, m/s."""
+def _wall_speeds(scene: Scene) -> list[float]:
+    """Every part's highest speed of a corner at the scene's frames, m/s."""
     times = scene.frame_dt_s * torch.arange(scene.n_frames, dtype=torch.float64)
     speeds = []
     for name, part in scene.boundary.items():
+        fastest = 0.0
         if part.motion.moves:
             corners = torch.from_numpy(np.array(build_mesh(name, part).vertices))
             for time_s in times:
                 vel = to_world(part.motion, corners, time_s.expand(len(corners)))[1]
-                speeds.append(torch.linalg.vector_norm(vel, dim=1).max())
+                fastest = max(fastest, float(torch.linalg.vector_norm(vel, dim=1).max()))
+        speeds.append(fastest)
     return speeds

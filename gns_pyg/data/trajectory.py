@@ -13,7 +13,7 @@ import numpy as np
 
 from gns_pyg.data.schema import FIXED_UNITS, GRAINS, H5MD_VERSION, RUN_KEYS, UNITS, violations
 from gns_pyg.errors import DataError, StorageError
-from gns_pyg.files import REMEDY, remove, unfinished
+from gns_pyg.files import REMEDY, clean_stale, remove, unfinished
 
 CHUNK_FRAMES = 8
 STARTERS = 8  # grains whose first positions tell a run
@@ -28,6 +28,7 @@ class Trajectory:
 
     Attributes:
         n_frames, n_grains: size.
+        fields: what `read` can read, e.g. position.
         times_s: (n_frames,) float64.
         radius, mass: (n_grains,) float64, m and kg.
         scene: the scene as resolved, a plain dict.
@@ -64,6 +65,7 @@ class Trajectory:
     def _read_fixed(self, file: h5py.File) -> None:
         grains = file[GRAINS]
         self._stored, self.n_grains = grains["position/value"].shape[:2]
+        self.fields = [name for name in UNITS if name in grains]
         self.has_active = "active" in grains
         self.times_s = grains["position/time"][:: self.every].astype(np.float64)
         self.n_frames = len(self.times_s)
@@ -79,7 +81,7 @@ class Trajectory:
         """Returns frames [start, stop) of `field` (position, velocity, angular_velocity), float64 (n, n_grains, 3)."""
         if self._file is None:  # opened on first use, so that data-loader workers hold handles of their own
             self._file = h5py.File(self.path, "r")
-        if field not in self._file[GRAINS]:
+        if field not in self.fields:
             raise DataError(self.path, f"no {field}", f"the field {field}", "use a DEM run, which stores all fields")
         return self._file[GRAINS][field]["value"][self._frames(start, stop)].astype(np.float64)
 
@@ -163,6 +165,7 @@ class TrajectoryWriter:
         self._temporary = unfinished(self.path)
         try:
             self.path.parent.mkdir(parents=True, exist_ok=True)
+            clean_stale(self.path)
             self._file = h5py.File(self._temporary, "w")
             self._create(scene, radius, mass, boundary, decimals, with_active)
         except (OSError, RuntimeError) as error:

@@ -42,7 +42,7 @@ class Captured:
             after, needed = self._replay(state) if state.pos.is_cuda else self.step(state)
             needs = needed.tolist()  # the step's only wait for the device
             if all(need <= room for need, room in zip(needs, self.capacities, strict=True)):
-                return after
+                return self.simulator.guarded(state, after)
             grown = [
                 room if need <= room else int(SLACK * need) + 1
                 for need, room in zip(needs, self.capacities, strict=True)
@@ -72,7 +72,8 @@ class Captured:
             self._output = self.step(self._input)
 
     def step(self, state: State) -> tuple[State, Int[Tensor, " n_capacities"]]:
-        """The next state, and the capacities it would have needed: right only if they are no more than there were."""
+        """The next state, as `Simulator.advance` gives it, and the capacities it would have needed: right only if they
+        are no more than there were."""
         graph, needed = self.graph(state)
         correction = self.simulator.effects(_one_more(state), graph)[:-1]
         if state.active is not None:

@@ -9,13 +9,16 @@ import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor, nn
 
+from gns_pyg.config import require
 from gns_pyg.dynamics.boundary import Boundary
 from gns_pyg.dynamics.execution import Execution
 from gns_pyg.dynamics.free_grains import among, can_touch
+from gns_pyg.dynamics.guard import Guard
 from gns_pyg.dynamics.integrator import Integrator
 from gns_pyg.dynamics.model_config import ModelConfig
 from gns_pyg.dynamics.passage import Passage
 from gns_pyg.dynamics.projection import separated
+from gns_pyg.dynamics.rest import rested
 from gns_pyg.dynamics.tiles import tiles
 from gns_pyg.graph import features
 from gns_pyg.graph.neighbors import backend, pairs
@@ -25,6 +28,8 @@ from gns_pyg.scene.boundary_points import BoundaryPoints
 from gns_pyg.scene.requirements import Requirements
 from gns_pyg.scene.scene import PARAMETERS, Scene
 from gns_pyg.state import Graph, State, Walls, constant
+
+FARTHEST = 20.0  # standard deviations of the training cases' positions
 
 
 class Simulator(nn.Module):
@@ -79,17 +84,31 @@ class Simulator(nn.Module):
                 n_sender=n_point, n_receiver=n_grain, n_edge=n_edge, sparse=reachable, **width
             )
         self.passage = Passage(scene) if requires.active_mask else None
+        self.guard = Guard(scene) if scene.boundary else None
 
     def forward(self, state: State) -> State:
         """Moves every grain by one frame."""
-        return self.advance(state, self.correction(state))
+        return self.guarded(state, self.advance(state, self.correction(state)))
 
     def advance(self, state: State, correction: Float[Tensor, "n_grains d"]) -> State:
-        """The next state, given what contacts add."""
+        """The next state, given what contacts add, as if no grain could go through a wall."""
         after = self.integrator.integrate(state, correction * self.scale)
         if self.config.projection_sweeps:
             after = self._separated(state, after)
+        if self.requires.rest:
+            still = torch.zeros_like(state.vel)
+            gained = self.integrator.without_contact(replace(state, vel=still)).vel
+            after = rested(state, after, torch.linalg.vector_norm(gained, dim=1))
         return after if self.passage is None else self.passage(state, after)
+
+    def guarded(self, before: State, after: State) -> State:
+        """`after`, without what went through a wall (see `guard`)."""
+        if self.guard is None:
+            return after
+        held = self.guard(before, after)
+        if self.requires.state == "differences" and held is not after:
+            held = replace(held, vel=(held.pos - before.pos) / self.scene.frame_dt_s)
+        return held
 
     def _separated(self, state: State, after: State) -> State:
         there = after if after.active is None else replace(after.pick(after.active), active=None)
@@ -147,6 +166,11 @@ class Simulator(nn.Module):
                 points = self._wall_features(graph.walls)
                 total = total + self.wall_network(points, grains, edges, graph.wall_edges).to(self.scale.dtype)
         return total
+
+    @property
+    def settles(self) -> bool:
+        """Whether a state that a step leaves as it was stays so: nothing drives it from outside."""
+        return self.requires.rest and self.scene.inlet is None
 
     @property
     def halo_m(self) -> float:
@@ -209,6 +233,18 @@ class Simulator(nn.Module):
         if self.config.absolute_position:
             columns.append(self._absolute(walls.pos))
         return torch.cat(columns, dim=1).to(self.scale.dtype)
+
+    def check_place(self, state: State) -> None:
+        """Raises ConfigError if the model sees absolute positions and the grains are far from where it learned them."""
+        if self.config.absolute_position and len(state.pos):
+            farthest = float(self._absolute(state.pos).abs().max())
+            require(
+                farthest <= FARTHEST,
+                "model.absolute_position",
+                f"true, and a grain {farthest:.3g} standard deviations from the training cases' mean position",
+                f"at most {FARTHEST:g}: the model knows no other place",
+                "simulate where it was trained, or train with model.absolute_position=false",
+            )
 
     def _absolute(self, pos: Tensor) -> Tensor:
         return (pos - constant(self.statistics.position_mean_m, pos)) / self.statistics.position_std_m

@@ -43,10 +43,24 @@ def coordination_number(ratios: Sequence[np.ndarray], pos: np.ndarray) -> np.nda
         return 2 * contacts / present(pos).sum(axis=1)
 
 
+def contacts_per_grain(pos: np.ndarray, radius: np.ndarray) -> np.ndarray:
+    """Number of grains that every grain touches, (n_frames, n_grains); nan where a grain is absent."""
+    counts = np.full(pos.shape[:2], np.nan)
+    for count, frame, there in zip(counts, pos, present(pos), strict=True):
+        pairs = _touching(frame[there], radius[there])[0]
+        count[there] = np.bincount(pairs.ravel(), minlength=there.sum())
+    return counts
+
+
 def _overlaps(pos: np.ndarray, radius: np.ndarray) -> np.ndarray:
+    return _touching(pos, radius)[1]
+
+
+def _touching(pos: np.ndarray, radius: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Pairs (n, 2) of one frame's grains that touch, and the overlap of each (see `overlap_ratios`)."""
     if len(pos) == 0:
-        return np.empty(0)
-    first, second = cKDTree(pos).query_pairs(2 * radius.max(), output_type="ndarray").T
-    reach = radius[first] + radius[second]
-    ratio = 1 - np.linalg.norm(pos[first] - pos[second], axis=1) / reach
-    return ratio[ratio > 0]
+        return np.empty((0, 2), int), np.empty(0)
+    pairs = cKDTree(pos).query_pairs(2 * radius.max(), output_type="ndarray")
+    first, second = pairs.T
+    ratio = 1 - np.linalg.norm(pos[first] - pos[second], axis=1) / (radius[first] + radius[second])
+    return pairs[ratio > 0], ratio[ratio > 0]

@@ -2,6 +2,8 @@
 
 from collections.abc import Sequence
 
+import numpy as np
+
 from gns_pyg.data.trajectory import Trajectory
 from gns_pyg.dynamics.simulator import Simulator
 from gns_pyg.evaluation.baselines import FIRST_FRAME, Climatology
@@ -26,6 +28,13 @@ def compare(simulator: Simulator, case: Trajectory, start_s: float) -> CaseResul
         NumericalError: see `judge`.
     """
     start = start_frame(case, start_s)
-    pos, seconds = roll_out(simulator, case, start)
+    return judge_rollout(simulator, case, start, *roll_out(simulator, case, start))
+
+
+def judge_rollout(
+    simulator: Simulator, case: Trajectory, start: int, pos: np.ndarray, seconds_per_simulated_second: float
+) -> CaseResult:
+    """Puts a finished roll-out from the case's frame `start`, positions (n_frames - start, n_grains, 3), m, beside DEM,
+    with single steps along the whole case."""
     errors = one_step_errors(simulator, case)
-    return case_result(case, simulator.scene, pos, start, errors, FIRST_FRAME, seconds)
+    return case_result(case, simulator.scene, pos, start, errors, FIRST_FRAME, seconds_per_simulated_second)

@@ -130,14 +130,15 @@ def case_result(
         one_step_error_m=np.asarray(one_step_error_m, np.float64)[skipped:],
         trivial_error_m={key: error[first - FIRST_FRAME :][:n] for key, error in trivial.items()},
         seconds_per_simulated_second=seconds_per_simulated_second,
-        yade_seconds_per_simulated_second=_dem_seconds(run) / span_s,
+        yade_seconds_per_simulated_second=dem_seconds(run) / span_s,
         yade_cores=int(run["cores"]),
         yade_dt_s=float(run["dt_s"]),
         twins=read_twins(trajectory, trajectory.times_s[start_frame:stop]),
     )
 
 
-def _dem_seconds(run: Mapping[str, Any]) -> float:
+def dem_seconds(run: Mapping[str, Any]) -> float:
+    """What a DEM run took, s, from its stored facts (see `CaseResult`)."""
     return float(run.get("cpu_time_s", run["wall_clock_s"]) if run["cores"] == 1 else run["wall_clock_s"])
 
 

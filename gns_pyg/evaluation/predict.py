@@ -1,5 +1,7 @@
 """Running a simulator against a recorded case."""
 
+import logging
+import math
 import time
 from collections import deque
 from collections.abc import Callable
@@ -12,6 +14,7 @@ from typing import Any
 
 import numpy as np
 import torch
+from tqdm import tqdm
 
 from gns_pyg.config import require
 from gns_pyg.data.trajectory import Trajectory, TrajectoryWriter
@@ -19,10 +22,11 @@ from gns_pyg.data.windows import read_window
 from gns_pyg.dynamics.captured import Captured
 from gns_pyg.dynamics.rollout import rollout
 from gns_pyg.dynamics.simulator import Simulator
-from gns_pyg.errors import DataError
+from gns_pyg.errors import DataError, NumericalError
 from gns_pyg.evaluation.errors import position_error
 from gns_pyg.state import State, Window
 
+log = logging.getLogger(__name__)
 MOST_WAITING = 8  # frames that may wait to be written
 
 
@@ -102,6 +106,9 @@ def write_rollout(simulator: Simulator, trajectory: Trajectory, start: int, path
 
     Returns:
         Wall seconds per simulated second, without the writing.
+
+    Raises:
+        NumericalError: if the roll-out diverges; the frames before lie beside `path` as NAME_stopped.h5.
     """
     scene, n_steps, state = (
         replace(simulator.scene, frame_dt_s=steps_per_frame(simulator, trajectory) * simulator.scene.frame_dt_s),
@@ -126,7 +133,11 @@ def write_rollout(simulator: Simulator, trajectory: Trajectory, start: int, path
             if len(waiting) > MOST_WAITING:
                 waiting.popleft().result()
 
-        seconds = _run(simulator, state, n_steps, steps_per_frame(simulator, trajectory), hand_over)
+        stopped: NumericalError | None = None
+        try:
+            seconds = _run(simulator, state, n_steps, steps_per_frame(simulator, trajectory), hand_over)
+        except NumericalError as error:  # what was good so far is kept, under another name
+            stopped, seconds, writer.path = error, math.nan, path.with_name(f"{path.stem}_stopped{path.suffix}")
         for frame in waiting:
             frame.result()
         writer.finish(
@@ -140,6 +151,9 @@ def write_rollout(simulator: Simulator, trajectory: Trajectory, start: int, path
                 "start_from": trajectory.path.name,
             }
         )
+    if stopped is not None:
+        stopped.remedy += f"; the frames before are in {writer.path}"
+        raise stopped
     return seconds / (n_steps * scene.frame_dt_s)
 
 
@@ -176,14 +190,28 @@ def roll_out_from(simulator: Simulator, trajectory: Trajectory, start: int, stat
 def _run(simulator: Simulator, state: State, n_frames: int, steps: int, see: Callable[[int, State], None]) -> float:
     """Shows `see` the state and the `n_frames` that follow it, each `steps` steps after the last, on the CPU; returns
     the wall seconds of the roll-out."""
+    simulator.check_place(state)
     see(0, state)
     step = Captured(simulator) if simulator.execution.capture else simulator
-    states, seconds = rollout(step, state.to(simulator.scale.device), n_frames * steps), 0.0
-    for number in range(1, n_frames + 1):
+    options: dict[str, Any] = dict(settles=simulator.settles, reach_m=simulator.cutoff_m)
+    states, seconds = rollout(step, state.to(simulator.scale.device), n_frames * steps, **options), 0.0
+    if simulator.guard is not None:
+        simulator.guard.reset()
+    for number in tqdm(range(1, n_frames + 1), desc="roll-out", unit="frame", leave=False, disable=None):
         begin = time.perf_counter()
         following = deque(islice(states, steps), maxlen=1)[0].to("cpu")
         seconds += time.perf_counter() - begin
         see(number, following)
+    if simulator.guard is not None and (first := simulator.guard.first) is not None:
+        log.warning(
+            "%d times a grain would have gone through a wall and was stopped there, first grain %d at %.3g m/s at "
+            "t = %.4g s (%s)",
+            simulator.guard.crossings,
+            first.grain,
+            first.speed_m_s,
+            first.time_s,
+            first.part,
+        )
     return seconds
 
 

@@ -1,6 +1,7 @@
 """Edge features, dimensionless: lengths over the grain radius (the mean of two), velocities over the data's scale.
 
-Differences are taken in the state's float64, then cast to the networks' dtype.
+They are computed in the state's float64 and cast to the networks' dtype last: a gap is a small difference of lengths,
+and in float32 its rounding would be most of what float32 networks get wrong in a step.
 Edge features follow Mayr et al. 2023 (the paper's [17]): relative position, distance, direction and inverse powers of
 the distance; `contact` adds what a contact law would ask for: gap, approach, slip with spin, and the gap to come.
 """
@@ -20,22 +21,21 @@ def grain_edges(
 ) -> Float[Tensor, "n_grain_edges f"]:
     """Features of grain-grain edges; `rel_pos` points from receiver to sender."""
     sender, receiver = graph.grain_edges
-    rel_pos = _between(state.pos, sender, receiver, dtype)
-    own = state.radius.to(dtype)
-    touch = own[sender] + own[receiver]
+    rel_pos = _between(state.pos, sender, receiver)
+    touch = state.radius[sender] + state.radius[receiver]
     radius = touch / 2
     distance, direction = _polar(rel_pos, radius)
     features = _geometry(rel_pos, distance, direction, radius)
     if contact:
-        rel_vel = _between(state.vel, sender, receiver, dtype)
+        rel_vel = _between(state.vel, sender, receiver)
         slip = rel_vel
         if state.ang_vel is not None:  # surface velocities at the contact: v + w x arm, arms of opposite sign
-            arm = (state.radius[:, None] * state.ang_vel).to(dtype)
+            arm = state.radius[:, None] * state.ang_vel
             turning = arm.index_select(0, sender) + arm.index_select(0, receiver)
             slip = rel_vel - torch.linalg.cross(turning, direction)
         ahead = torch.linalg.vector_norm(rel_pos + rel_vel * dt_s, dim=1)
         features += _contact(distance - touch, ahead - touch, rel_vel, slip, direction, radius, velocity_m_s, dt_s)
-    return torch.cat(features, dim=1)
+    return torch.cat(features, dim=1).to(dtype)
 
 
 def wall_edges(
@@ -43,20 +43,20 @@ def wall_edges(
 ) -> Float[Tensor, "n_wall_edges f"]:
     """Features of edges from boundary points to grains; the gap is that to the point's tangent plane."""
     point, grain = graph.wall_edges
-    rel_pos = (walls.pos.index_select(0, point) - state.pos.index_select(0, grain)).to(dtype)
-    radius, normal = state.radius[grain].to(dtype), walls.normal.to(dtype).index_select(0, point)
+    rel_pos = walls.pos.index_select(0, point) - state.pos.index_select(0, grain)
+    radius, normal = state.radius[grain], walls.normal.index_select(0, point)
     distance, direction = _polar(rel_pos, radius)
     height = -dot(rel_pos, normal)
     features = [*_geometry(rel_pos, distance, direction, radius), (height / radius)[:, None]]
     if contact:
-        rel_vel = (walls.vel.index_select(0, point) - state.vel.index_select(0, grain)).to(dtype)
+        rel_vel = walls.vel.index_select(0, point) - state.vel.index_select(0, grain)
         slip = rel_vel
         if state.ang_vel is not None:
-            arm = (state.radius[:, None] * state.ang_vel).to(dtype)
+            arm = state.radius[:, None] * state.ang_vel
             slip = rel_vel + torch.linalg.cross(arm.index_select(0, grain), normal)
         ahead = height - dot(rel_vel, normal) * dt_s
         features += _contact(height - radius, ahead - radius, rel_vel, slip, -normal, radius, velocity_m_s, dt_s)
-    return torch.cat(features, dim=1)
+    return torch.cat(features, dim=1).to(dtype)
 
 
 def dot(a: Float[Tensor, "n 3"], b: Float[Tensor, "n 3"]) -> Float[Tensor, " n"]:
@@ -65,9 +65,8 @@ def dot(a: Float[Tensor, "n 3"], b: Float[Tensor, "n 3"]) -> Float[Tensor, " n"]
     return x + y + z
 
 
-def _between(values: Tensor, sender: Tensor, receiver: Tensor, dtype: torch.dtype) -> Tensor:
-    """Differences, taken before the cast."""
-    return (values.index_select(0, sender) - values.index_select(0, receiver)).to(dtype)
+def _between(values: Tensor, sender: Tensor, receiver: Tensor) -> Tensor:
+    return values.index_select(0, sender) - values.index_select(0, receiver)
 
 
 def n_grain_edge_features(contact: bool) -> int:

@@ -14,7 +14,7 @@ if ONE_DNN and torch.ops.mkldnn._is_mkldnn_bf16_supported():
 
 
 class Mlp(nn.Sequential):
-    """Linear layers with ReLU between them; without gradients on a CPU, both in one kernel of oneDNN."""
+    """Linear layers with ReLU between them; without gradients on a CPU, oneDNN's own kernels."""
 
     def forward(self, rows: Tensor) -> Tensor:
         modules = list(self)
@@ -44,11 +44,10 @@ def linear(layer: nn.Linear, rows: Tensor, *, relu: bool = False) -> Tensor:
     cast = torch.get_autocast_dtype("cpu") if torch.is_autocast_enabled("cpu") else layer.weight.dtype
     if rows.device.type == "cpu" and {rows.dtype, cast} <= FUSED and not torch.is_grad_enabled():
         bias = None if layer.bias is None else layer.bias.to(cast)
-        # what torch.compile would call, without compiling
-        return torch.ops.mkldnn._linear_pointwise(
-            rows.to(cast), layer.weight.to(cast), bias, "relu" if relu else "none", [], ""
-        )
-    rows = layer(rows)
+        # what torch.compile would call, without compiling; not its own "relu", which makes a silent 0 of nan
+        rows = torch.ops.mkldnn._linear_pointwise(rows.to(cast), layer.weight.to(cast), bias, "none", [], "")
+    else:
+        rows = layer(rows)
     return rows.relu_() if relu else rows
 
 

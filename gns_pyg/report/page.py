@@ -1,25 +1,36 @@
-"""One HTML page that holds a whole report: figures, figures' numbers, scene, config, versions. Nothing is loaded."""
+"""One HTML page that holds a whole report, the 3D player included. Nothing is loaded: it opens from disk."""
 
-import base64
 import html
+import json
 from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from gns_pyg.errors import DataError
+from gns_pyg.errors import BundleError
+from gns_pyg.evaluation.metrics import CaseResult
 from gns_pyg.files import whole
-from gns_pyg.report.table import metric_rows
-from gns_pyg.scene.scene import Motion, Scene
+from gns_pyg.report import sections
+from gns_pyg.report.player import ASSETS, player
+from gns_pyg.scene.requirements import Requirements
+from gns_pyg.scene.scene import Scene
 
-STYLE = """
-body { font: 16px/1.5 system-ui, sans-serif; color: #1a1a1a; max-width: 60rem; margin: 2rem auto; padding: 0 1rem; }
-h1 { font-size: 1.5rem; } h2 { font-size: 1.15rem; margin-top: 2.2rem; }
-table { border-collapse: collapse; } th, td { padding: .3rem .9rem .3rem 0; text-align: left; vertical-align: top; }
-thead th { border-bottom: 2px solid #1a1a1a; } tbody tr { border-bottom: 1px solid #ddd; }
-td.number { white-space: nowrap; font-variant-numeric: tabular-nums; }
-figure { margin: 1.2rem 0; } img { max-width: 100%; height: auto; }
-pre { background: #f5f5f5; padding: .8rem; overflow-x: auto; font-size: .85rem; }
-"""
+
+@dataclass(frozen=True)
+class Model:
+    """What a page says of the model beside its figures.
+
+    Attributes:
+        name: the bundle, as `bundle=...` would name it.
+        requires: what it was built of.
+        card: what it was trained on and what that cost.
+        stability: rows of the stress suite, None where it was not run.
+    """
+
+    name: str
+    requires: Requirements
+    card: Mapping[str, Any]
+    stability: Sequence[Mapping[str, Any]] | None = None
 
 
 def write_page(
@@ -27,7 +38,9 @@ def write_page(
     title: str,
     metrics: Mapping[str, Any],
     figures: Sequence[Path],
+    shown: CaseResult,
     scene: Scene,
+    model: Model,
     config_yaml: str,
     versions: Mapping[str, str],
 ) -> Path:
@@ -36,99 +49,54 @@ def write_page(
     Args:
         path: the page, e.g. report.html.
         title: its heading.
-        metrics: the flat dict of `evaluate_cases`.
+        metrics: the flat dict of `evaluate_cases`, with `speed/threads` and `speed/device`.
         figures: files of `write_plots`; the PNGs among them are shown.
-        scene: summarised in a table.
+        shown: the case that the player plays.
+        scene: what was simulated.
+        model: what simulated it.
         config_yaml: the resolved config of the run.
         versions: program or package -> version.
     """
     path = Path(path)
-    sections = [
-        ("How good it is", _metrics(metrics)),
-        ("Figures", "".join(_figure(file) for file in figures if file.suffix == ".png")),
-        ("Scene", _pairs(scene_summary(scene))),
-        ("Config", f"<details><summary>all keys</summary><pre>{html.escape(config_yaml)}</pre></details>"),
-        ("Versions", _pairs(versions)),
+    parts = [
+        ("DEM and network", player(shown, scene)),
+        ("How good it is", sections.errors(metrics, scene)),
+        ("Speed and break-even", sections.speed(metrics, model.card.get("cost"), scene)),
+        ("Stability", sections.stability(model.stability, model.name)),
+        ("Curves", sections.figures(figures)),
+        ("What was simulated", sections.pairs(sections.scene_summary(scene))),
+        ("What the scene required of the model", sections.requirements(model.requires)),
+        ("Configuration", sections.config(config_yaml)),
+        ("Versions", sections.pairs(versions)),
     ]
-    body = "".join(f"<section><h2>{html.escape(heading)}</h2>{content}</section>" for heading, content in sections)
+    body = "".join(f"<section><h2>{html.escape(heading)}</h2>{content}</section>" for heading, content in parts)
+    style = (ASSETS / "page.css").read_text(encoding="utf-8")
     text = (
         f'<!DOCTYPE html><html lang="en"><head><meta charset="utf-8"><title>{html.escape(title)}</title>'
-        f'<meta name="viewport" content="width=device-width"><style>{STYLE}</style></head>'
-        f"<body><h1>{html.escape(title)}</h1>{body}</body></html>\n"
+        f'<meta name="viewport" content="width=device-width"><style>{style}</style></head>'
+        f"<body><h1>{html.escape(title)}</h1>{sections.lead(scene, model.card)}{body}</body></html>\n"
     )
     with whole(path) as temporary:
         temporary.write_text(text, encoding="utf-8")
     return path
 
 
-def scene_summary(scene: Scene) -> dict[str, str]:
-    """What a reader must know of a scene, in human units."""
-    material = scene.grains.material
-    walls = [
-        f"{name}: {part.shape.get('kind', '?')}, {part.points} boundary points{_moving(part.motion)}"
-        for name, part in scene.boundary.items()
-    ]
-    damped = "gravity included" if scene.damping_on_gravity else "gravity excluded"
-    summary = {
-        "grains": ", ".join(f"{n} of {2e3 * radius_m:g} mm" for radius_m, n in scene.grains.counts) + " diameter",
-        "material": f"{material.density_kg_m3:g} kg/m\N{SUPERSCRIPT THREE}, Young's modulus "
-        f"{material.young_modulus_pa:.3g} Pa, friction angle {material.friction_angle_rad:g} rad",
-        "boundary": "; ".join(walls) or "none",
-        "gravity": f"{_vector(scene.gravity_m_s2)} m/s\N{SUPERSCRIPT TWO}",
-        "damping": f"{scene.damping:g} ({damped})" if scene.damping else "none",
-        "run": f"{scene.duration_s:g} s, a frame every {1e3 * scene.frame_dt_s:g} ms",
-    }
-    if scene.vary:
-        values = (f"{name} ({', '.join(f'{v:g}' for v in of)})" for name, of in scene.vary.items())
-        summary["differs from case to case"] = ", ".join(values)
-    if (outlet := scene.outlet) is not None:
-        summary["outlet"] = f"beyond the plane through {_vector(outlet.point_m)} m, outwards {_vector(outlet.normal)}"
-    if (inlet := scene.inlet) is not None:
-        speed = f"{_vector(inlet.velocity_m_s)} m/s"
-        summary["inlet"] = (
-            f"{inlet.count} grains, {inlet.rate_per_s:g} per s, at {_vector(inlet.center_m)} m with {speed}"
-        )
-    return summary
+def read_stability(bundle: Path, card: Mapping[str, Any]) -> Sequence[Mapping[str, Any]] | None:
+    """What the stress suite said of a bundle: stability.json in its folder or beside it, else its card's `stability`.
 
-
-def _moving(motion: Motion) -> str:
-    if not motion.moves:
-        return ""
-    verb, unit = ("turning", "rad") if motion.kind == "rotation" else ("moving", "m")
-    if motion.kind == "oscillation":
-        return f", oscillating by {1e3 * motion.amplitude_m:g} mm at {motion.frequency_hz:g} Hz"
-    if motion.function is not None:
-        return f", {verb} by {motion.function} {unit}"
-    return f", {verb} at {motion.rate_rad_s or motion.speed_m_s:g} {unit}/s"
-
-
-def _vector(values: Sequence[float]) -> str:
-    return f"({', '.join(f'{value:g}' for value in values)})"
-
-
-def _metrics(metrics: Mapping[str, Any]) -> str:
-    heading, *rows = metric_rows(metrics)
-    head = "".join(f"<th>{html.escape(cell)}</th>" for cell in heading)
-    body = "".join(
-        f'<tr><th scope="row">{html.escape(what)}</th><td class="number">{html.escape(own)}</td>'
-        f"<td>{html.escape(beside)}</td></tr>"
-        for what, own, beside in rows
-    )
-    return f"<table><thead><tr>{head}</tr></thead><tbody>{body}</tbody></table>"
-
-
-def _pairs(pairs: Mapping[str, str]) -> str:
-    rows = "".join(
-        f'<tr><th scope="row">{html.escape(str(what))}</th><td>{html.escape(str(value))}</td></tr>'
-        for what, value in pairs.items()
-    )
-    return f"<table><tbody>{rows}</tbody></table>"
-
-
-def _figure(file: Path) -> str:
+    Raises:
+        BundleError: if the file is not a list of {"line": str, "holds": true, false or null, "found": str}.
+    """
+    file = next((f / "stability.json" for f in (bundle, bundle.parent) if (f / "stability.json").is_file()), None)
+    if file is None:
+        return card.get("stability")
     try:
-        content = base64.b64encode(file.read_bytes()).decode("ascii")
-    except OSError as error:
-        raise DataError(file, str(error), "a PNG figure", "draw the plots before the page") from error
-    name = html.escape(file.stem.replace("_", " "))
-    return f'<figure><img alt="{name}" src="data:image/png;base64,{content}"></figure>'
+        rows = json.loads(file.read_text(encoding="utf-8"))
+        sound = all(isinstance(row["line"], str) and row["holds"] in sections.HOLDS for row in rows)
+        sound = sound and all(isinstance(row["found"], str) for row in rows)
+    except (OSError, ValueError, KeyError, TypeError):
+        sound = False
+    if not sound:
+        expected = 'a list of {"line": text, "holds": true, false or null, "found": text}'
+        raise BundleError(file, "something else", expected, "run stress.py again, or delete the file")
+    return rows

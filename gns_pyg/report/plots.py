@@ -6,7 +6,6 @@ from pathlib import Path
 from typing import Literal
 
 import numpy as np
-import torch
 from matplotlib.artist import Artist
 from matplotlib.axes import Axes
 from matplotlib.backends.backend_agg import FigureCanvasAgg
@@ -18,12 +17,12 @@ from trimesh import Trimesh
 
 from gns_pyg.evaluation.ensemble import Ensemble
 from gns_pyg.evaluation.errors import mean_present, present
-from gns_pyg.evaluation.metrics import CaseEvaluation, Evaluation, Observables
+from gns_pyg.evaluation.metrics import CaseEvaluation, CaseResult, Evaluation, Observables
 from gns_pyg.evaluation.observables import finite_difference_velocity
 from gns_pyg.files import whole
+from gns_pyg.report.view import COLOUR_QUANTILE, placed, view
 from gns_pyg.scene.mesh import build_mesh
-from gns_pyg.scene.motion import to_world
-from gns_pyg.scene.scene import Motion, Scene
+from gns_pyg.scene.scene import Scene
 from gns_pyg.scene.symmetry import up_direction
 
 Style = Literal["-", "--", ":"]
@@ -32,9 +31,9 @@ BLUE, VERMILION, GREEN, PURPLE, ORANGE, SKY = "#0072B2", "#D55E00", "#009E73", "
 CASE_COLORS = (BLUE, VERMILION, GREEN, PURPLE, ORANGE, SKY)
 DEM: Style = "-"
 NETWORK: Style = "--"
+SPEED_BINS = 40
 CLIMATOLOGY: Style = ":"
 PAPER_FINAL_ERROR_MM = {"hopper": 93.9, "drum": 79.0}  # sections 5.1: hopper at 2 s, drum at 3 s
-SPEED_QUANTILE = 0.99  # the colour scale ends here, so that one fast grain does not darken all others
 
 
 def write_plots(evaluation: Evaluation, scene: Scene, folder: str | Path) -> list[Path]:
@@ -61,13 +60,15 @@ def draw(evaluation: Evaluation, scene: Scene) -> dict[str, Figure]:
         "overlap": overlap(evaluation, scene),
         "mean_speed": mean_speed(evaluation, scene),
         "granular_temperature": granular_temperature(evaluation, scene),
-        "snapshots": snapshots(evaluation.cases[0], scene),
+        "speed_distribution": speed_distribution(evaluation, scene),
     }
     if scene.angle_of_repose is not None:
         figures["angle_of_repose"] = angle_of_repose(evaluation, scene)
     if scene.outlet is not None:
         figures["outflow"] = outflow(evaluation, scene)
-    return figures
+    if scene.mouth_height_m is not None:
+        figures["discharge"] = discharge(evaluation, scene)
+    return figures | {"snapshots": snapshots(evaluation.cases[0], scene)}
 
 
 def rollout_error(evaluation: Evaluation, scene: Scene) -> Figure:
@@ -157,13 +158,24 @@ def outflow(evaluation: Evaluation, scene: Scene) -> Figure:
     return _finish(figure, axes, handles=_style_handles(evaluation, climatology=True), note=note)
 
 
+def discharge(evaluation: Evaluation, scene: Scene) -> Figure:
+    """Part of the mass that has passed the mouth against time, every test case."""
+    figure, axes = _figure(f"{scene.name}: discharge", "mass that has passed the mouth (%)")
+    _compare(
+        axes, evaluation, lambda observed: np.zeros(0) if observed.discharged is None else 100 * observed.discharged
+    )
+    return _finish(figure, axes, handles=_style_handles(evaluation, climatology=False))
+
+
 def overlap(evaluation: Evaluation, scene: Scene) -> Figure:
     """Mean overlap of touching pairs against time, every test case."""
     figure, axes = _figure(f"{scene.name}: overlap of touching grains", "mean overlap (% of a diameter)")
     _compare(axes, evaluation, lambda observed: 100 * observed.overlap_ratio)
     if any((case.model.overlap_ratio > 0).any() for case in evaluation.cases):
         axes.set_yscale("log")
-    return _finish(figure, axes, handles=_style_handles(evaluation, climatology=False), note="frame 0 is DEM's own")
+    return _finish(
+        figure, axes, handles=_style_handles(evaluation, climatology=False), note="the first frame is DEM's own"
+    )
 
 
 def mean_speed(evaluation: Evaluation, scene: Scene) -> Figure:
@@ -172,6 +184,25 @@ def mean_speed(evaluation: Evaluation, scene: Scene) -> Figure:
     _compare(axes, evaluation, lambda observed: observed.mean_speed_m_s)
     note = "displacement over one frame, in DEM as in the network"
     return _finish(figure, axes, handles=_style_handles(evaluation, climatology=False), note=note)
+
+
+def speed_distribution(evaluation: Evaluation, scene: Scene) -> Figure:
+    """How often grains have which speed, over all cases and the frames of the roll-outs."""
+    figure, axes = _figure(f"{scene.name}: speed distribution", "probability density (s/m)", xlabel="speed (m/s)")
+    speeds = {
+        name: np.concatenate([_speeds(case.result, of).ravel() for case in evaluation.cases])
+        for name, of in (("DEM", "dem_pos"), ("network", "pos"))
+    }
+    known = {name: values[np.isfinite(values)] for name, values in speeds.items()}
+    fastest = max((values.max() for values in known.values() if len(values)), default=0.0)
+    edges = np.linspace(0.0, max(fastest, 1e-6), SPEED_BINS + 1)
+    for (name, values), color, style in zip(known.items(), ("black", VERMILION), (DEM, NETWORK), strict=True):
+        density = np.histogram(values, edges)[0] / max(len(values), 1) / np.diff(edges)
+        axes.stairs(
+            np.where(density > 0, density, np.nan), edges, color=color, linestyle=style, linewidth=1.6, label=name
+        )
+    axes.set_yscale("log")
+    return _finish(figure, axes, note="displacement over one frame, all grains, frames and cases")
 
 
 def granular_temperature(evaluation: Evaluation, scene: Scene) -> Figure:
@@ -194,16 +225,16 @@ def snapshots(case: CaseEvaluation, scene: Scene, n_times: int = 4) -> Figure:
     """
     result = case.result
     frames = np.unique(np.linspace(0, len(result.times_s) - 2, n_times).round().astype(int))
-    right, up, depth = _view(scene)
+    right, up, depth = view(scene)
     rows = {"DEM": result.dem_pos, "network": result.pos}
     speeds = {
         name: np.linalg.norm(finite_difference_velocity(pos, result.times_s)[frames], axis=2)
         for name, pos in rows.items()
     }
     known = np.concatenate([speed[np.isfinite(speed)] for speed in speeds.values()])
-    fast = float(np.quantile(known, SPEED_QUANTILE)) if len(known) else 0.0
+    fast = float(np.quantile(known, COLOUR_QUANTILE)) if len(known) else 0.0
     scale = Normalize(0.0, max(fast, 1e-6))
-    (left, low), (edge, high) = _frame_of_view(case, scene, right, up)
+    (left, low), (edge, high) = frame_of_view(case, scene, right, up)
     width = 2.3
     size = (width * len(frames) + 1.0, 2 * width * float(np.clip((high - low) / (edge - left), 0.5, 2.0)) + 0.9)
     figure = _bare_figure(size, "compressed")
@@ -220,7 +251,7 @@ def snapshots(case: CaseEvaluation, scene: Scene, n_times: int = 4) -> Figure:
             grains.set(array=speed[order], norm=scale, cmap="viridis", edgecolor="0.15", linewidth=0.15)
             grains.set_rasterized(True)  # thousands of circles would make an SVG of many megabytes
             axes.add_collection(grains)
-            axes.add_collection(_wall_lines(scene, float(result.times_s[frame]), right, up, depth))
+            axes.add_collection(wall_lines(scene, float(result.times_s[frame]), right, up, depth))
             axes.set(xlim=(left, edge), ylim=(low, high), aspect="equal", xticks=[], yticks=[])
             axes.spines[:].set_visible(False)
         row[0].set_ylabel(name, fontsize=11)
@@ -263,11 +294,11 @@ def _bare_figure(size: tuple[float, float], layout: Literal["constrained", "comp
     return figure
 
 
-def _figure(title: str, ylabel: str) -> tuple[Figure, Axes]:
+def _figure(title: str, ylabel: str, xlabel: str = "time (s)") -> tuple[Figure, Axes]:
     figure = _bare_figure((6.4, 4.0))
     axes = figure.subplots()
     axes.set_title(title, fontsize=11)
-    axes.set(xlabel="time (s)", ylabel=ylabel)
+    axes.set(xlabel=xlabel, ylabel=ylabel)
     axes.grid(color="0.88", linewidth=0.6)
     axes.spines[["top", "right"]].set_visible(False)
     return figure, axes
@@ -329,25 +360,16 @@ def _running_mean(values: np.ndarray, half: int) -> np.ndarray:
     return np.where(count > 0, total / np.maximum(count, 1.0), np.nan)
 
 
+def _speeds(result: CaseResult, of: str) -> np.ndarray:
+    """Finite-difference speeds (n_frames - 1, n_grains), m/s, nan where a grain is absent."""
+    return np.linalg.norm(finite_difference_velocity(getattr(result, of), result.times_s), axis=2)
+
+
 def _longest(evaluation: Evaluation) -> np.ndarray:
     return max((case.result.times_s for case in evaluation.cases), key=len)
 
 
-def _view(scene: Scene) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Unit vectors to the right, up (against gravity) and towards the reader."""
-    up = up_direction(scene)
-    definition = scene.angle_of_repose
-    wanted = [np.asarray(definition.axis, float)] if definition is not None and definition.kind == "plane" else []
-    for motion in (part.motion for part in scene.boundary.values() if part.motion.moves):
-        axis = np.asarray(motion.axis, float)
-        wanted.append(axis if motion.kind == "rotation" else np.cross(up, axis))
-    wanted += [np.array([0.0, -1.0, 0.0]), np.array([1.0, 0.0, 0.0])]
-    across = (axis - (axis @ up) * up for axis in wanted)
-    depth = next(axis / np.linalg.norm(axis) for axis in across if np.linalg.norm(axis) > 1e-6)
-    return np.cross(up, depth), up, depth
-
-
-def _frame_of_view(case: CaseEvaluation, scene: Scene, right: np.ndarray, up: np.ndarray) -> np.ndarray:
+def frame_of_view(case: CaseEvaluation, scene: Scene, right: np.ndarray, up: np.ndarray) -> np.ndarray:
     """Corners (2, 2) of the view, with a margin: every place of the boundary, and DEM's grains where it does not hold
     them in."""
     pos, times_s = case.result.dem_pos, case.result.times_s
@@ -357,27 +379,21 @@ def _frame_of_view(case: CaseEvaluation, scene: Scene, right: np.ndarray, up: np
     for name, mesh in meshes.items():
         motion = scene.boundary[name].motion
         turn_s = np.linspace(0, 2 * np.pi / abs(motion.rate_rad_s), 13) if motion.rate_rad_s else times_s
-        seen += [_placed(mesh, motion, float(time_s)) for time_s in (turn_s if motion.moves else [0.0])]
+        seen += [placed(mesh, motion, float(time_s)) for time_s in (turn_s if motion.moves else [0.0])]
     points = np.concatenate(seen) @ np.stack([right, up], axis=1)
     margin = 0.04 * np.ptp(points, axis=0).max() + scene.grains.radii_m[-1] * (not holds)
     return np.stack([points.min(axis=0) - margin, points.max(axis=0) + margin])
 
 
-def _wall_lines(scene: Scene, time_s: float, right: np.ndarray, up: np.ndarray, depth: np.ndarray) -> LineCollection:
+def wall_lines(scene: Scene, time_s: float, right: np.ndarray, up: np.ndarray, depth: np.ndarray) -> LineCollection:
     """Silhouette of every boundary part as it stands at `time_s`."""
     lines = []
     for name, part in scene.boundary.items():
         mesh = build_mesh(name, part)
-        placed = _placed(mesh, part.motion, time_s)
-        edges = _silhouette(Trimesh(placed, mesh.faces, process=False), depth)
-        lines.append(placed[edges] @ np.stack([right, up], axis=1))
+        moved = placed(mesh, part.motion, time_s)
+        edges = _silhouette(Trimesh(moved, mesh.faces, process=False), depth)
+        lines.append(moved[edges] @ np.stack([right, up], axis=1))
     return LineCollection([edge for part_lines in lines for edge in part_lines], colors="0.3", linewidths=0.8)
-
-
-def _placed(mesh: Trimesh, motion: Motion, time_s: float) -> np.ndarray:
-    """Vertices of a part at `time_s`, (n, 3), m."""
-    vertices = torch.tensor(np.array(mesh.vertices))
-    return to_world(motion, vertices, torch.full((len(vertices),), time_s, dtype=torch.float64))[0].numpy()
 
 
 def _silhouette(mesh: Trimesh, depth: np.ndarray) -> np.ndarray:

@@ -106,7 +106,9 @@ def metric_rows(metrics: Mapping[str, Any]) -> list[tuple[str, str, str]]:
     own, yade = (metrics.get(f"speed/{name}seconds_per_simulated_second") for name in ("", "yade_"))
     factor = ""
     if own is not None and yade is not None and own > 0:
-        factor = f", network {yade / own:.3g} times as fast"
+        factor = (
+            f", network {yade / own:.3g} times as fast" if own < yade else f", network slower, {own / yade:.3g} times"
+        )
     n_threads = metrics.get("speed/threads")
     threads = f" (on {n_threads} thread{'' if n_threads == 1 else 's'})" if n_threads else ""
     cores, yade_dt = (

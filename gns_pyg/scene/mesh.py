@@ -23,7 +23,10 @@ BLOCK = 20_000  # point-triangle pairs handled at once: few enough to stay in th
 class Revolution:
     """`profile_m` ([[radius, z], ...] from the bottom up) turned about z and closed to the axis at both ends.
 
-    `open_bottom` leaves the lower lid out (above a scene's outlet); grains are then still on the inner side.
+    Attributes:
+        profile_m: two or more [radius, z].
+        segments: flat pieces around the axis.
+        open_bottom: leaves the lower lid out (above a scene's outlet); grains are then still on the inner side.
     """
 
     profile_m: list[Any] = MISSING  # pairs of numbers: OmegaConf would refuse whole ones in nested lists of floats
@@ -51,7 +54,14 @@ class Revolution:
 
 @dataclass
 class Cylinder:
-    """Closed cylinder centred at the origin, its axis along `axis`; corners lie on the radius."""
+    """Closed cylinder centred at the origin.
+
+    Attributes:
+        radius_m: corners lie on it.
+        length_m: between its end caps.
+        axis: its direction.
+        segments: flat pieces around the axis.
+    """
 
     radius_m: float = MISSING
     length_m: float = MISSING
@@ -71,7 +81,12 @@ class Cylinder:
 
 @dataclass
 class Box:
-    """Closed box with its edges along x, y and z."""
+    """Closed box with its edges along x, y and z.
+
+    Attributes:
+        size_m: of its edges.
+        center_m: its middle.
+    """
 
     size_m: list[float] = MISSING
     center_m: list[float] = field(default_factory=lambda: [0.0, 0.0, 0.0])
@@ -86,7 +101,12 @@ class Box:
 
 @dataclass
 class Floor:
-    """Horizontal rectangle with edges along x and y; grains are above it."""
+    """Horizontal rectangle with edges along x and y; grains are above it.
+
+    Attributes:
+        size_m: along x and y.
+        center_m: its middle.
+    """
 
     size_m: list[float] = MISSING
     center_m: list[float] = field(default_factory=lambda: [0.0, 0.0, 0.0])
@@ -102,7 +122,12 @@ class Floor:
 
 @dataclass
 class File:
-    """A mesh file that trimesh reads (STL, OBJ, PLY, ...); `scale` turns its unit into metres (0.001 for mm)."""
+    """A mesh file.
+
+    Attributes:
+        path: a file that trimesh reads (STL, OBJ, PLY, ...), from where the command runs or in the package.
+        scale: turns its unit into metres: 0.001 for mm.
+    """
 
     path: str = MISSING
     scale: float = 1.0

@@ -5,7 +5,7 @@ forced by one config key (conf/requires/*.yaml), unless that would leave out wha
 """
 
 from collections.abc import Mapping, Sequence
-from dataclasses import asdict, dataclass, field
+from dataclasses import asdict, dataclass, field, replace
 from typing import Any, Union
 
 from gns_pyg.config import require
@@ -29,6 +29,7 @@ class Requires:
     material_features: Union[bool, str] = "auto"
     symmetry: Union[bool, str] = "auto"
     active_mask: Union[bool, str] = "auto"
+    rest: Union[bool, str] = "auto"
     state: str = "auto"
 
     def __post_init__(self) -> None:
@@ -55,6 +56,7 @@ class Requirements:
         material_features: parameters (of `scene.PARAMETERS`) that condition the networks.
         symmetry: training windows are turned and mirrored by the scene's own symmetry.
         active_mask: grains leave or enter.
+        rest: a grain that stands stays (see `dynamics.rest`).
         state: what the state holds (see `dynamics.integrator`).
         reasons: row -> why, for people.
     """
@@ -71,6 +73,7 @@ class Requirements:
     symmetry: bool
     active_mask: bool
     state: str
+    rest: bool = False  # bundles made before have none
     reasons: dict[str, str] = field(default_factory=dict)
 
     def __str__(self) -> str:
@@ -112,8 +115,9 @@ def resolve(scene: Scene, parameters: Mapping[str, Sequence[float]], requires: R
         rows[row], reasons[row] = forced, f"forced; {reason}"
     if not isinstance(rows["material_features"], list):
         rows["material_features"] = list(PARAMETERS) if rows["material_features"] else []
-    if requires.free_grains == "auto":
-        rows["free_grains"] = rows["free_flight"]
+    for row in ("free_grains", "rest"):  # they need the law
+        if getattr(requires, row) == "auto":
+            rows[row] = rows[row] and rows["free_flight"]
     for row in ("wall_velocity", "wall_friction", "static_walls", "reachable_points"):
         carried = rows["wall_network"] or not rows[row]
         require(carried, f"requires.{row}", "true", "a wall network to carry it", "set requires.wall_network=true too")
@@ -137,6 +141,22 @@ def check_covers(trained: Requirements, scene: Scene) -> None:
         has = getattr(trained, row) or not needed[row][0]
         remedy = f"{LOST[row]}: train on a scene that has it"
         require(has, f"requires.{row}", "false in the bundle", f"true: {needed[row][1]}", remedy)
+
+
+def stands(scene: Scene) -> bool:
+    """Whether grains can come to rest in a scene: gravity holds them down, and no wall moves."""
+    return any(scene.gravity_m_s2) and not any(part.motion.moves for part in scene.boundary.values())
+
+
+def transferred(trained: Requirements, own: Scene, scene: Scene) -> Requirements:
+    """What a model that was trained for `own` is made of in another scene: its networks stay what they are.
+
+    Raises:
+        ConfigError: if the model lacks what the other scene needs (see `check_covers`).
+    """
+    check_covers(trained, scene)
+    rest = stands(scene) and trained.free_flight and (trained.rest or not stands(own))
+    return replace(trained, active_mask=scene.outlet is not None or scene.inlet is not None, rest=rest)
 
 
 def _derive(scene: Scene, parameters: Mapping[str, Sequence[float]]) -> dict[str, tuple[Any, str]]:
@@ -168,8 +188,15 @@ def _derive(scene: Scene, parameters: Mapping[str, Sequence[float]]) -> dict[str
         "material_features": (varying, "vary between cases" if varying else "one material: no material feature"),
         "symmetry": (not own.trivial, own.describe()),
         "active_mask": (bool(passing), " and ".join(passing) or "no grain leaves or enters: no mask"),
+        "rest": (stands(scene), _standing(scene, moving)),
         "state": (scene.state, "as data_gen.restart measured it (docs/state.md)"),
     }
+
+
+def _standing(scene: Scene, moving: Sequence[str]) -> str:
+    if moving:
+        return f"moving: {', '.join(moving)}: nothing comes to rest"
+    return "a grain that stands stays" if any(scene.gravity_m_s2) else "no gravity: nothing comes to rest"
 
 
 def _search(n_parts: int, n_moving: int) -> str:

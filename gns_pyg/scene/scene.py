@@ -45,11 +45,18 @@ def _friction_angle(where: str, angle_rad: float) -> None:
 
 @dataclass
 class Material:
-    """Elastic-frictional contact material (Yade's FrictMat; the paper's Table 1)."""
+    """Elastic-frictional contact material (Yade's FrictMat; the paper's Table 1).
+
+    Attributes:
+        density_kg_m3: of the grains.
+        young_modulus_pa: Yade's FrictMat: normal stiffness over the radius.
+        poisson_ratio: Yade's FrictMat: the ratio of shear to normal stiffness.
+        friction_angle_rad: between grains.
+    """
 
     density_kg_m3: float = MISSING
     young_modulus_pa: float = MISSING
-    poisson_ratio: float = MISSING  # Yade's FrictMat: the ratio of shear to normal stiffness
+    poisson_ratio: float = MISSING
     friction_angle_rad: float = MISSING
 
     def __post_init__(self) -> None:
@@ -147,6 +154,7 @@ class Motion:
     Attributes:
         kind: `none`; `rotation` about the line through `origin_m`; `translation`; `oscillation` (a sine way).
         axis: direction of the rotation axis or of the way.
+        origin_m: a point of the rotation axis.
         rate_rad_s: of a rotation.
         speed_m_s: of a translation.
         amplitude_m, frequency_hz: of an oscillation; its way is amplitude_m sin(2 pi frequency_hz t).
@@ -214,7 +222,7 @@ class Part:
             length_m, axis, segments}`, `{kind: box, size_m, center_m}`, `{kind: floor, size_m, center_m}` or
             `{kind: file, path, scale}` (STL, OBJ, ...).
         points: number of boundary points the network sees.
-        friction_angle_rad: wall friction angle, rad.
+        friction_angle_rad: between grains and this part.
     """
 
     shape: dict[str, Any] = field(default_factory=dict)
@@ -232,8 +240,14 @@ class Part:
 
 @dataclass
 class AngleOfRepose:
-    """How the angle of repose is read: `plane` (surface line in the plane across `axis`; a drum) or `radial`
-    (height against distance from the vertical axis; a heap), averaged over frames from `from_s` on."""
+    """How the angle of repose is read.
+
+    Attributes:
+        kind: `plane` (surface line in the plane across `axis`; a drum) or `radial` (height against distance from the
+            vertical axis; a heap).
+        axis: of a drum.
+        from_s: its mean is over the frames from here on.
+    """
 
     kind: str = MISSING
     axis: list[float] = field(default_factory=lambda: [1.0, 0.0, 0.0])
@@ -298,10 +312,17 @@ class Inlet:
 
 @dataclass
 class Dem:
-    """How Yade runs. `dt_s` is a number or `auto` (a third of the P-wave step)."""
+    """How Yade runs.
+
+    Attributes:
+        dt_s: the time step, or `auto`, a third of the P-wave step (see docs/time_step.md).
+        verlet_distance_ratio: how far grains may move before Yade sorts them anew, over the radius; see
+            docs/assumptions.md.
+        decimals: digits after the point that the trajectory file keeps of each field, in SI units.
+    """
 
     dt_s: Union[float, str] = "auto"
-    verlet_distance_ratio: float = 0.3  # of the radius; see docs/assumptions.md
+    verlet_distance_ratio: float = 0.3
     decimals: dict[str, int] = field(default_factory=lambda: {"position": 7, "velocity": 5, "angular_velocity": 3})
 
     def __post_init__(self) -> None:
@@ -320,6 +341,14 @@ class Scene:
     """Everything that defines a granular scene. Lengths in m, times in s, angles in rad.
 
     Attributes:
+        name: cases are looked for in a folder of this name.
+        duration_s: of a case.
+        frame_dt_s: time between recorded frames, and of a step of the network.
+        cases: how many there are, or are to be.
+        seed: of the cases' starts and of the boundary points.
+        gravity_m_s2: its three components.
+        damping: Cundall's non-viscous damping, Yade's NewtonIntegrator; at least 0 and below 1.
+        damping_on_gravity: whether it damps gravity too, as Yade does by default.
         mouth_height_m: height of a hopper's mouth (from the origin, against gravity), for its rate of discharge.
         vary: parameters (of PARAMETERS) that change from case to case -> their values; case n has value n modulo
             their number (see `of_case`).
@@ -332,7 +361,7 @@ class Scene:
     cases: int = MISSING
     seed: int = 0
     gravity_m_s2: list[float] = MISSING
-    damping: float = MISSING  # Cundall's non-viscous damping, Yade's NewtonIntegrator
+    damping: float = MISSING
     damping_on_gravity: bool = True
     grains: Grains = MISSING
     initial: Initial = MISSING

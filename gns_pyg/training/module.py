@@ -22,6 +22,8 @@ from gns_pyg.training.augment import transform
 from gns_pyg.training.checkpoint import REMEDY
 from gns_pyg.training.config import TrainingConfig
 
+MOST = 1e15  # of any number in a checkpoint beside its tensors
+
 
 class TrainingModule(pl.LightningModule):
     """One-step training, on perturbed frames and on the simulator's own steps.
@@ -82,7 +84,29 @@ class TrainingModule(pl.LightningModule):
                 "; ".join(f"{key} = {now.get(key)}" for key in keys),
                 "resume with the config and data of the checkpoint, or start anew in another folder without ckpt_path",
             )
+        self._check_progress(checkpoint)
         self._check_tensors(checkpoint)
+
+    def _check_progress(self, checkpoint: Mapping[str, Any]) -> None:
+        """Schedule, optimiser's settings and counts of what is done must be such as this run would have written."""
+        fresh = cast(Any, self.configure_optimizers())
+        group, schedule = fresh["optimizer"].state_dict()["param_groups"], fresh["lr_scheduler"]["scheduler"]
+        for where, found, expected in (
+            ("optimizer_states.0.param_groups", checkpoint["optimizer_states"][0]["param_groups"], group),
+            ("lr_schedulers", checkpoint["lr_schedulers"], [schedule.state_dict()]),
+            ("loops.fit_loop", checkpoint["loops"]["fit_loop"], self.trainer.fit_loop.state_dict()),
+            ("global_step", checkpoint["global_step"], 0),
+            ("epoch", checkpoint["epoch"], 0),
+        ):
+            if wrong := unlike(found, expected, where):
+                raise CheckpointError("ckpt_path", *wrong, REMEDY)
+        done = checkpoint["loops"]["fit_loop"]["epoch_loop.automatic_optimization.optim_progress"]["optimizer"]["step"]
+        counts = {done["total"]["completed"], checkpoint["global_step"], checkpoint["lr_schedulers"][0]["last_epoch"]}
+        if len(counts) != 1:
+            raise CheckpointError("ckpt_path", f"{sorted(counts)} updates done", "one number of updates", REMEDY)
+        ((then,), (now,)) = checkpoint["optimizer_states"][0]["param_groups"], group
+        if then | {"lr": None} != now | {"lr": None}:  # the rate alone changes
+            raise CheckpointError("ckpt_path", f"optimiser {then!r:.200}", f"{now!r:.200}", REMEDY)
 
     def _check_tensors(self, checkpoint: Mapping[str, Any]) -> None:
         expected: dict[str, Tensor] = dict(self.state_dict())
@@ -153,6 +177,25 @@ class TrainingModule(pl.LightningModule):
             optimizer, lambda update: 0.5 ** min(int(update / stretch), self.config.halvings)
         )
         return {"optimizer": optimizer, "lr_scheduler": {"scheduler": schedule, "interval": "step"}}
+
+
+def unlike(found: Any, expected: Any, where: str) -> tuple[str, str] | None:
+    """The first place where nested plain values are not of the kind of others: other keys, lengths or types, or
+    numbers below 0 or not finite; (what is there, what should be) or None."""
+    if type(found) is not type(expected):
+        return f"{where}: {found!r:.60}", f"{type(expected).__name__}, e.g. {expected!r:.60}"
+    if isinstance(expected, dict):
+        if found.keys() != expected.keys():
+            return f"{where}: {found!r:.60}", f"the keys {', '.join(map(str, expected))}"
+        return next((w for key in expected if (w := unlike(found[key], expected[key], f"{where}.{key}"))), None)
+    if isinstance(expected, list | tuple):
+        if len(found) != len(expected):
+            return f"{where}: {len(found)} values", f"{len(expected)} values"
+        pairs = enumerate(zip(found, expected, strict=True))
+        return next((w for n, pair in pairs if (w := unlike(*pair, f"{where}.{n}"))), None)
+    if isinstance(expected, int | float) and not 0 <= found <= MOST:
+        return f"{where}: {found!r:.60}", f"0 to {MOST:g}"
+    return None
 
 
 def mean_loss(error: Float[Tensor, "n d"], knee: float) -> Float[Tensor, ""]:

@@ -1,7 +1,7 @@
 import numpy as np
 import pytest
 
-from gns_pyg.data.coverage import coverage, outside_coverage, values
+from gns_pyg.data.coverage import WALLS, coverage, outside_coverage, values
 from gns_pyg.data.trajectory import Trajectory
 from tests import scenes
 
@@ -40,3 +40,5 @@ def test_outside_is_named_and_inside_is_not(tmp_path):
     assert "0.6; the model has seen 0.5" in texts[0]
     _, slower = case(tmp_path / "c.h5", 0.1, 0.5)
     assert outside_coverage(trained, coverage(scene, [slower])) == []
+    (text,) = outside_coverage(coverage(other_scene, [other]), coverage(other_scene, [other]) | {WALLS: [0.0, 0.0]})
+    assert text.startswith("wall speed, m/s: 0; the model has seen")

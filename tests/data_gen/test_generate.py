@@ -49,7 +49,7 @@ def run(folder: Path, *overrides: str) -> subprocess.CompletedProcess:
 
 
 def names(folder: Path) -> list[str]:
-    return sorted(path.name for path in folder.iterdir())
+    return sorted(path.name for path in folder.iterdir() if path.name != ".lock")
 
 
 def dem_run(path: Path, scene: Scene, start: Start, **arguments) -> Trajectory:
@@ -153,6 +153,15 @@ class TestCommand:
         assert (tmp_path / "case_000.h5").stat().st_mtime_ns == written
         assert names(tmp_path) == ["case_000.h5"]
 
+    def test_two_commands_for_one_case_run_it_once(self, tmp_path) -> None:
+        words = command(tmp_path, "scene.duration_s=0.2")
+        both = [subprocess.Popen(words, cwd=ROOT, stdout=subprocess.PIPE, text=True) for _ in range(2)]
+        said = sorted(process.communicate(timeout=120)[0] for process in both)
+        assert [process.returncode for process in both] == [0, 0]
+        assert ["complete;" in text for text in said].count(True) == 1
+        assert ["nothing to do" in text for text in said].count(True) == 1
+        assert names(tmp_path) == ["case_000.h5"]
+
     def test_many_cases_run_side_by_side_with_progress_per_case(self, tmp_path) -> None:
         overrides = ["case=0,1", "hydra/launcher=joblib", "hydra.launcher.n_jobs=2", f"hydra.sweep.dir={tmp_path}/runs"]
         done = run(tmp_path / "data", "-m", *overrides)
@@ -183,7 +192,8 @@ class TestCommand:
             assert b"status -9" in process.stderr.read()
         process.stderr.close()
 
-    def test_ctrl_c_ends_yade_and_leaves_nothing(self, tmp_path) -> None:
+    @pytest.mark.parametrize("stop", [signal.SIGINT, signal.SIGTERM])
+    def test_ctrl_c_and_a_cluster_end_yade_and_leave_nothing(self, tmp_path, stop) -> None:
         process = subprocess.Popen(
             command(tmp_path, "scene.duration_s=100"),
             cwd=ROOT,
@@ -192,7 +202,7 @@ class TestCommand:
             preexec_fn=lambda: signal.signal(signal.SIGINT, signal.SIG_DFL),  # background jobs inherit it ignored
         )
         part = wait_for(lambda: next(tmp_path.glob(".case_000.h5.*.part"), None))
-        process.send_signal(signal.SIGINT)
+        process.send_signal(stop)
         assert process.wait(timeout=30) != 0
         wait_for(lambda: not Path(f"/proc/{part.name.split('.')[-2]}").exists())
         assert names(tmp_path) == []

@@ -48,6 +48,14 @@ def test_free_flight_equals_fine_time_stepping(v0, dt, damping):
     assert torch.allclose(end_pos[0, :2], torch.tensor([0.3 * dt, 0.0], dtype=torch.float64))
 
 
+def test_every_graph_has_its_own_damping():
+    integrator = Integrator(scenes.scene(1, 5, damping=0.9), "full", free_flight=True)
+    state = replace(state_in_box([3, 2]), vel=torch.zeros(5, 3, dtype=torch.float64))
+    parameters = torch.tensor([[1000.0, 1e6, 0.25, 0.5, damping] for damping in (0.0, 0.4)], dtype=torch.float64)
+    fallen = integrator.without_contact(replace(state, parameters=parameters)).vel[:, 2]
+    assert fallen.tolist() == pytest.approx([-0.0981] * 3 + [-0.6 * 0.0981] * 2)
+
+
 def test_damping_that_spares_gravity_leaves_plain_ballistics():
     scene = replace(scenes.scene(1, 5, damping=0.5), damping_on_gravity=False)
     pos, vel = free_flight(torch.zeros(1, 3, dtype=torch.float64), torch.ones(1, 3, dtype=torch.float64), scene, 0.1)

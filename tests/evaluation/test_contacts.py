@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from gns_pyg.evaluation.contacts import coordination_number, mean_overlap_ratio, overlap_ratios
+from gns_pyg.evaluation.contacts import contacts_per_grain, coordination_number, mean_overlap_ratio, overlap_ratios
 
 
 def test_overlap_of_two_spheres():
@@ -31,3 +31,8 @@ def test_grains_of_a_cubic_lattice_have_six_neighbours(spacing):
     found = coordination_number(overlap_ratios(pos, np.full(28, 0.01)), pos)
     np.testing.assert_allclose(found, [4.0 if spacing < 0.02 else 0.0])
     assert np.isnan(coordination_number(overlap_ratios(absent, np.full(1, 0.01)), absent)).all()
+
+
+def test_contacts_are_counted_on_both_grains_of_a_pair():
+    pos = np.array([[[0.0, 0, 0], [0.019, 0, 0], [np.nan] * 3, [0.0375, 0, 0], [1.0, 0, 0]]])
+    np.testing.assert_array_equal(contacts_per_grain(pos, np.full(5, 0.01)), [[1, 2, np.nan, 1, 0]])

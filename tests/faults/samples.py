@@ -1,5 +1,6 @@
 """One sound, tiny file of every kind that is read from outside, and what opening each of them means."""
 
+import shutil
 from collections.abc import Callable
 from dataclasses import asdict
 from pathlib import Path
@@ -15,13 +16,16 @@ from omegaconf.errors import OmegaConfBaseException
 
 from gns_pyg import bundle, run
 from gns_pyg.config import CONF, plain
+from gns_pyg.data.datamodule import open_to_compare
 from gns_pyg.data.trajectory import Trajectory
 from gns_pyg.dynamics.rollout import rollout
 from gns_pyg.errors import ConfigError
+from gns_pyg.evaluation.baselines import Climatology
+from gns_pyg.evaluation.predict import start_frame
 from gns_pyg.scene.mesh import build_mesh
 from gns_pyg.scene.scene import Scene
 from tests import scenes
-from tests.simulators import simulator, state_in_box
+from tests.simulators import state_in_box
 
 N_GRAINS, N_FRAMES = 5, 20
 SHAPE = {"kind": "box", "size_m": [0.4, 0.4, 0.4]}
@@ -73,11 +77,11 @@ def write_samples(folder: Path) -> None:
     """A sound sample of every kind, each under its name in OPEN, and the data that the checkpoint belongs to."""
     (folder / "data").mkdir(parents=True)
     scene = write_cases(folder / "data")
-    train(folder / "data", folder / "run")
+    train(folder / "data", folder / "run", "training.updates=9")
     (folder / "trajectory.h5").write_bytes((folder / "data" / "case_000.h5").read_bytes())
     (folder / "scene.yaml").write_bytes((folder / "data" / "scene.yaml").read_bytes())
     (folder / "checkpoint.ckpt").write_bytes((folder / "run" / "checkpoints" / "last.ckpt").read_bytes())
-    bundle.save(folder / "bundle", simulator(scene, cutoff_wall_radii=8.0), {"cases": {}})
+    shutil.copytree(folder / "run" / "bundle", folder / "bundle")
     build_mesh("walls", scene.boundary["walls"]).export(folder / "mesh.stl")
 
 
@@ -95,16 +99,21 @@ def open_trajectory(path: Path, data: Path) -> None:
 
 
 def open_bundle(path: Path, data: Path) -> None:
-    """Loads a bundle and takes a step with it."""
-    assert isinstance(bundle.describe(path)["card"], dict)
-    loaded = bundle.load(path)
+    """Does what rollout.py and evaluate.py do with a bundle, for one step."""
+    loaded, card = bundle.load(path), bundle.card(path)
+    run.unseen_cases(loaded.scene, str(data), card, None)
+    case = open_to_compare(data / "case_000.h5", loaded.scene)
+    run.warn_outside(loaded.scene, case, start_frame(case, 0.02), card)
+    expected = Climatology.from_plain(card["climatology"])
+    assert expected.center_of_mass_at(case.times_s).shape == (N_FRAMES, 3)
+    assert isinstance(expected.mean_angle_of_repose_deg(loaded.scene), float)
     state = state_in_box([N_GRAINS], spin=loaded.requires.state == "full")
     (after,) = rollout(loaded, state, 1)
     assert after.pos.shape == state.pos.shape
 
 
 def open_checkpoint(path: Path, data: Path) -> None:
-    """Resumes from a checkpoint of a finished run: everything is restored, nothing is left to train."""
+    """Resumes from a checkpoint of 9 updates and trains on to 12."""
     train(data, path.parent / "run", f"ckpt_path={path}")
     weights = bundle.load(path.parent / "run" / "bundle").state_dict()
     assert all(torch.isfinite(value).all() for value in weights.values())

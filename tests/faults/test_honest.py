@@ -9,11 +9,13 @@ import torch
 from gns_pyg import run
 from gns_pyg.data.datamodule import DataConfig, split
 from gns_pyg.data.statistics import measure
+from gns_pyg.data.trajectory import Trajectory
 from gns_pyg.dynamics.integrator import Integrator
 from gns_pyg.errors import ConfigError, DataError
 from gns_pyg.evaluation.judge import judge
 from gns_pyg.evaluation.metrics import write_json
 from gns_pyg.evaluation.twins import read_twins, twins_path
+from gns_pyg.results import kept_for_testing
 from gns_pyg.scene.scene import Scene
 from tests.faults import samples
 
@@ -78,6 +80,14 @@ def test_twins_of_another_run_are_refused(data):
     write_json(twins_path(second.path), stored | {"content_hash": first.content_hash()})
     with pytest.raises(DataError, match="twins of the run"):
         read_twins(second, second.times_s)
+
+
+def test_results_are_those_of_the_runs_kept_for_testing_whatever_their_names(data):
+    cases = {case.content_hash(): case for case in map(Trajectory, sorted(data.glob("case_*.h5")))}
+    digest = next(iter(cases))
+    assert kept_for_testing(cases, {"cases": {"test": {"renamed.h5": digest}}}) == [cases[digest]]
+    with pytest.raises(DataError, match=r"case_000\.h5[\s\S]*no case of the hash 0123"):
+        kept_for_testing(cases, {"cases": {"test": {"case_000.h5": "0123"}}})
 
 
 def test_resuming_with_other_data_is_refused_and_the_difference_named(data, tmp_path):

@@ -4,7 +4,7 @@ import pytest
 
 from tests.faults import mutations, samples
 
-N = {"trajectory.h5": 200, "bundle": 80, "scene.yaml": 80, "mesh.stl": 80, "checkpoint.ckpt": 12}
+N = {"trajectory.h5": 150, "bundle": 40, "scene.yaml": 60, "mesh.stl": 60, "checkpoint.ckpt": 8}
 
 
 @pytest.fixture(scope="module")

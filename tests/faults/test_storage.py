@@ -1,5 +1,6 @@
 """A disk without room and folders that cannot be written to: a clear error, and what was there stays."""
 
+import os
 import shutil
 import subprocess
 import sys
@@ -14,7 +15,7 @@ from gns_pyg import bundle
 from gns_pyg.data.trajectory import Trajectory
 from gns_pyg.errors import ConfigError, DataError, StorageError
 from gns_pyg.evaluation.metrics import write_json
-from gns_pyg.files import held, whole
+from gns_pyg.files import held, unfinished, whole
 from gns_pyg.training.checkpoint import Checkpoints
 from tests import scenes
 from tests.faults import samples
@@ -54,7 +55,7 @@ def lock(folder):
 
 
 def names(folder):
-    return sorted(path.name for path in folder.iterdir() if path.name != "filler")
+    return sorted(path.name for path in folder.iterdir() if path.name not in ("filler", ".lock"))
 
 
 @pytest.mark.parametrize("spoil", [fill, lock])
@@ -127,6 +128,31 @@ with held(pathlib.Path({str(tmp_path)!r})):
         other.kill()
     with held(tmp_path):
         pass
+
+
+def test_a_second_command_in_a_run_folder_is_refused(tmp_path):
+    folder = tmp_path / "run"
+    words = ["train.py", "experiment=hopper", "training.updates=1", f"hydra.run.dir={folder}"]
+    with held(folder):
+        assert wait(command(lambda _: words)(folder)) != 0
+    assert f"{folder}: in use by another process" in folder.with_suffix(".log").read_text()
+    assert not (folder / "checkpoints").exists()
+
+
+def test_a_folder_whose_replacement_was_killed_between_its_renames_is_back(tmp_path):
+    ended = subprocess.Popen(["true"])
+    ended.wait()
+    path = tmp_path / "bundle"
+    kept = unfinished(path).name.replace(f".{os.getpid()}.part", f".{ended.pid}.old")
+    (tmp_path / kept).mkdir()
+    (tmp_path / kept / "bundle.json").write_text("old")
+    with pytest.raises(StorageError), whole(path):
+        raise OSError("no room")
+    assert (path / "bundle.json").read_text() == "old"
+    with whole(path) as temporary:
+        temporary.mkdir()
+    assert names(tmp_path) == ["bundle"]
+    assert names(path) == []
 
 
 def test_jobs_on_one_folder_and_readers_beside_them_see_whole_files(tmp_path):

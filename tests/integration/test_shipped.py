@@ -17,12 +17,16 @@ SHIPPED = sorted(path.name for path in bundle.SHIPPED.iterdir())
 
 @pytest.mark.parametrize("name", SHIPPED)
 def test_a_shipped_bundle_rolls_out_from_an_unseen_case_and_stays_near_it(name, tmp_path):
-    run.rollout(config(tmp_path, f"bundle={name}", "start_s=1.0", name="rollout"))
+    metrics = run.rollout(config(tmp_path, f"bundle={name}", "start_s=1.0", name="rollout"))
     written, card = Trajectory(tmp_path / "rollout.h5"), bundle.describe(name)["card"]
     dem = Trajectory(EMBEDDED / bundle.load(name).scene.name / written.run["start_from"])
     assert dem.path.name in card["cases"]["test"]
     error = position_error(positions(written)[:11], positions(dem, 100, 111))
     assert error[-1] < 0.01, "0.1 s of it: half a radius"
+    assert (
+        json.loads((tmp_path / "metrics.json").read_text())["test/one_step_error_m"] == metrics["test/one_step_error_m"]
+    )
+    assert f"{dem.path.stem} (unseen)" in (tmp_path / "report.html").read_text()
 
 
 def test_an_ensemble_says_mean_spread_and_score(tmp_path):

@@ -120,3 +120,16 @@ def test_computing_all_grains_gives_what_computing_the_reached_ones_gives(n_send
     out = everyone(senders, grains, edges, edge_index)
     assert torch.allclose(out, few(senders, grains, edges, edge_index), rtol=1e-5, atol=1e-7)
     assert torch.equal(out[[1, 3, 5, 6, 7, 8]], torch.zeros(6, 3))
+
+
+@pytest.mark.parametrize("value", [torch.nan, torch.inf])
+def test_what_is_not_finite_stays_so_without_gradients(value):
+    """A fast kernel's ReLU may turn nan into 0, and hide it."""
+    grains, edges = torch.randn(4, 3), torch.randn(3, 2)
+    edges[1, 0] = value
+    edge_index = torch.tensor([[0, 1, 2], [1, 0, 3]])
+    plain = network()(None, grains, edges, edge_index).detach()
+    with torch.inference_mode():
+        fast = network()(None, grains, edges, edge_index)
+    assert plain.isfinite().all(dim=1).tolist() == fast.isfinite().all(dim=1).tolist()
+    assert not fast.isfinite().all()

@@ -1,18 +1,22 @@
 """Figures, table and page of a small evaluation."""
 
+import dataclasses
+import json
 import re
 
 import numpy as np
 import pytest
 
 from gns_pyg.data.trajectory import Trajectory
-from gns_pyg.errors import DataError
+from gns_pyg.errors import BundleError, DataError
 from gns_pyg.evaluation.baselines import climatology
 from gns_pyg.evaluation.errors import positions
 from gns_pyg.evaluation.metrics import case_result, evaluate_cases
-from gns_pyg.report.page import scene_summary, write_page
+from gns_pyg.report.page import Model, read_stability, write_page
 from gns_pyg.report.plots import draw, write_plots
+from gns_pyg.report.sections import scene_summary
 from gns_pyg.report.table import metrics_table
+from gns_pyg.scene.requirements import Requires, resolve
 from gns_pyg.scene.scene import Motion
 from tests import scenes
 
@@ -39,7 +43,7 @@ def figures(heap, tmp_path_factory):
 
 def test_every_figure_is_written_as_png_and_svg(figures):
     names = {"rollout_error", "one_step_error", "center_of_mass", "angle_of_repose", "overlap", "mean_speed"}
-    names |= {"granular_temperature", "snapshots"}
+    names |= {"granular_temperature", "speed_distribution", "snapshots"}
     assert {file.stem for file in figures} == names
     for file in figures:
         assert file.read_bytes().startswith(b"\x89PNG" if file.suffix == ".png" else b"<?xml"), file
@@ -109,20 +113,101 @@ def test_table_shows_a_dash_for_what_is_not_known(heap):
     assert "nan" not in text
 
 
+CARD = {"cases": {"train": {"case_000.h5": "a"}, "val": {}, "test": {}, "answers": {}}}
+
+
+def page(heap, figures, path, card=CARD, stability=None, config="seed: 1", scene=None, **changes):
+    scene, evaluation = scene or heap[0], heap[1]
+    metrics = evaluation.metrics | {"speed/threads": 1, "speed/device": "a processor"} | changes
+    model = Model("runs/1/bundle", resolve(scene, {}, Requires()), card, stability)
+    shown, versions = evaluation.cases[0].result, {"torch": "2.4"}
+    write_page(path / "report.html", "A & B", metrics, figures, shown, scene, model, config, versions)
+    return (path / "report.html").read_text()
+
+
+def words(text):
+    """What a reader sees of a page."""
+    return re.sub(r"\s+", " ", re.sub(r"<script.*?</script>|<style.*?</style>|<[^>]+>", " ", text, flags=re.DOTALL))
+
+
 def test_page_is_self_contained(heap, figures, tmp_path):
-    scene, evaluation = heap
-    config = "name: <script>alert(1)</script>"
-    path = write_page(tmp_path / "report.html", "A & B", evaluation.metrics, figures, scene, config, {"torch": "2.4"})
-    text = path.read_text()
-    assert not re.search(r"https?:|//[a-z]|<script|<link|@import|url\(", re.sub(r"base64,[^\"]+", "", text))
+    text = page(heap, figures, tmp_path, config="name: <script>alert(1)</script>")
+    assert "<script>alert" not in text
+    shell = re.sub(r"<script.*?</script>", "", re.sub(r"base64,[^\"]+", "", text), flags=re.DOTALL)
+    assert not re.search(r"https?:|//[a-z]|<script|<link|@import|url\(", shell)
+    assert "<script src" not in text
     assert set(re.findall(r'src="([^,]+),', text)) == {"data:image/png;base64"}
     assert text.count("<img") == len(figures) // 2
+    assert text.count("</script>") == 4, "data, frames, three.js and the player, none of them cut short"
     assert "A &amp; B" in text
     assert "20 mm diameter" in text
     assert [entry.name for entry in tmp_path.iterdir()] == ["report.html"]
 
 
+def test_page_says_what_the_scene_required_and_why(heap, tmp_path):
+    text = words(page(heap, [], tmp_path))
+    assert "wall velocity no no part moves: no wall-velocity feature" in text
+    assert "trained on 1 case, 0 for validation" in text
+
+
+@pytest.mark.parametrize(
+    ("cost", "own", "verdict"),
+    [
+        ({"dem_s": 100.0, "training_s": 1000.0}, 2.0, r"after 95 roll-outs"),  # 1100 s over 58 s/s * 0.2 s
+        ({"dem_s": 100.0, "training_s": None}, 2.0, "not known: costs not recorded in this bundle"),
+        (None, 2.0, "not known: costs not recorded in this bundle"),
+        ({"dem_s": 100.0, "training_s": 1000.0}, 90.0, "never: the network is slower than Yade here"),
+        (None, 90.0, "never: the network is slower than Yade here"),
+    ],
+)
+def test_page_says_when_the_network_has_paid_for_itself(heap, tmp_path, cost, own, verdict):
+    card = CARD | ({} if cost is None else {"cost": cost})
+    text = words(page(heap, [], tmp_path, card, **{"speed/seconds_per_simulated_second": own}))
+    assert f"has paid for itself {verdict}" in text
+    assert ("slower than Yade: 1.5 times its time" in text) == (own == 90.0)
+
+
+def test_page_gives_the_papers_figures_and_says_where_they_do_not_compare(heap, tmp_path):
+    assert "The paper" not in words(page(heap, [], tmp_path))
+    full, small = (dataclasses.replace(heap[0], name=name) for name in ("hopper", "hopper_small"))
+    assert "93.9 mm at 2 s" in words(page(heap, [], tmp_path, scene=full))
+    assert "do not compare" not in words(page(heap, [], tmp_path, scene=full))
+    assert "hopper_small is another scene: the figures do not compare" in words(page(heap, [], tmp_path, scene=small))
+
+
+ROWS = [
+    {"line": "ten times the length", "holds": True, "found": "0 escaped"},
+    {"line": "twice the speed", "holds": False, "found": "3 escaped"},
+    {"line": "half the friction", "holds": None, "found": "no case"},
+]
+
+
+def test_page_states_the_stability_verdict_or_how_to_get_one(heap, tmp_path):
+    assert "not run: python stress.py bundle=runs/1/bundle" in words(page(heap, [], tmp_path))
+    text = words(page(heap, [], tmp_path, stability=ROWS))
+    assert "ten times the length holds 0 escaped" in text
+    assert "twice the speed does not hold 3 escaped" in text
+    assert "half the friction not known no case" in text
+
+
+def test_stability_is_read_from_the_bundle_beside_it_or_its_card(tmp_path):
+    bundle = tmp_path / "bundle"
+    bundle.mkdir()
+    assert read_stability(bundle, {}) is None
+    assert read_stability(bundle, {"stability": ROWS[2:]}) == ROWS[2:]
+    (tmp_path / "stability.json").write_text(json.dumps(ROWS[1:]))
+    assert read_stability(bundle, {"stability": ROWS[2:]}) == ROWS[1:]
+    (bundle / "stability.json").write_text(json.dumps(ROWS))
+    assert read_stability(bundle, {}) == ROWS
+
+
+@pytest.mark.parametrize("content", ["[", "{}x", "3", '[{"line": "a"}]', '[{"line": "a", "holds": 2, "found": "b"}]'])
+def test_a_stability_file_of_another_kind_is_refused(tmp_path, content):
+    (tmp_path / "stability.json").write_text(content)
+    with pytest.raises(BundleError, match=r"stability\.json"):
+        read_stability(tmp_path, {})
+
+
 def test_page_names_a_missing_figure(heap, tmp_path):
-    scene, evaluation = heap
     with pytest.raises(DataError, match=r"missing\.png"):
-        write_page(tmp_path / "r.html", "t", evaluation.metrics, [tmp_path / "missing.png"], scene, "", {})
+        page(heap, [tmp_path / "missing.png"], tmp_path)

@@ -3,6 +3,9 @@
 import pytest
 import torch
 
+from gns_pyg.data.trajectory import Trajectory
+from gns_pyg.data.windows import Windows
+from gns_pyg.state import Window
 from gns_pyg.training.config import TrainingConfig
 from gns_pyg.training.module import TrainingModule, mean_loss, perturb
 from tests import scenes
@@ -74,3 +77,25 @@ def test_the_loss_is_a_square_below_the_knee_and_a_length_above():
         assert loss.item() == 0
         assert not torch.autograd.grad(loss, still)[0].any()  # finite: no root of zero
         assert mean_loss(still[:0], knee).item() == 0
+
+
+@pytest.mark.parametrize("state", ["differences", "velocity", "full"])
+@pytest.mark.parametrize("own_steps", [0, 2])
+def test_free_flight_leaves_nothing_to_learn(state, own_steps, tmp_path, monkeypatch):
+    """Every step of every window, recorded or the model's own, is compared with the frame that it leads to."""
+    scene = scenes.free_flight_case(tmp_path / "case.h5", n_frames=9, damping=0.2, rising=False)
+    model = simulator(scene, state=state, dtype=torch.float64)
+    training = TrainingModule(model, TrainingConfig(**CONFIG | {"noise_radii": 0.0, "noise_velocity": 0.0}))
+    monkeypatch.setattr(training, "_own_steps", lambda random: own_steps)
+    monkeypatch.setattr(training, "log", lambda *_, **__: None)
+    windows = Windows([Trajectory(tmp_path / "case.h5")], training.config.window_length)
+    batch = Window.collate([windows[0], windows[len(windows) - 1]])
+    assert training.training_step(batch, 0).item() < 1e-8  # 0.1 um and 10 um/s of rounding in the file; a frame is 1
+
+
+def test_noise_is_seen_in_the_loss(tmp_path, monkeypatch):
+    scene = scenes.free_flight_case(tmp_path / "case.h5", n_frames=9)
+    training = TrainingModule(simulator(scene, dtype=torch.float64), TrainingConfig(**CONFIG))
+    monkeypatch.setattr(training, "log", lambda *_, **__: None)
+    window = Windows([Trajectory(tmp_path / "case.h5")], training.config.window_length)[0]
+    assert training.training_step(window, 0).item() > 1e-3

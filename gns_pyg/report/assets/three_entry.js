@@ -1,0 +1,27 @@
+// What the player uses of three.js; esbuild leaves the rest out.
+export {
+  AmbientLight,
+  ClampToEdgeWrapping,
+  Color,
+  DataTexture,
+  DirectionalLight,
+  DoubleSide,
+  EdgesGeometry,
+  BufferAttribute,
+  BufferGeometry,
+  Group,
+  InstancedBufferAttribute,
+  InstancedBufferGeometry,
+  LinearFilter,
+  LineBasicMaterial,
+  LineSegments,
+  Mesh,
+  MeshLambertMaterial,
+  OrthographicCamera,
+  Plane,
+  Scene,
+  ShaderMaterial,
+  Vector3,
+  WebGLRenderer,
+} from "three";
+export { OrbitControls } from "three/examples/jsm/controls/OrbitControls.js";
