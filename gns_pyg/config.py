@@ -29,9 +29,8 @@ def typed(record: type[Record], values: Any, where: str) -> Record:
     if not isinstance(values, Mapping) and not OmegaConf.is_dict(values):
         raise ConfigError(where, repr(values), f"a mapping with the keys of {record.__name__}", "see conf/")
     try:
-        if OmegaConf.is_config(values):  # what it refers to elsewhere in the config is lost once it is merged
-            values = OmegaConf.to_container(values, resolve=True)
-        merged = OmegaConf.merge(OmegaConf.structured(record), values)
+        told = OmegaConf.to_container(values, resolve=True) if OmegaConf.is_config(values) else values
+        merged = OmegaConf.merge(OmegaConf.structured(record), told)
         return cast(Record, OmegaConf.to_object(merged))
     except (OmegaConfBaseException, OverflowError) as error:  # the latter: a whole number too large for a float
         key = getattr(error, "full_key", None)

@@ -12,7 +12,7 @@ from gns_pyg.config import require
 from gns_pyg.evaluation.metrics import write_json
 from gns_pyg.files import whole
 from gns_pyg.report.plots import write_figure
-from gns_pyg.tradeoff.front import front, seconds
+from gns_pyg.tradeoff.front import front, runnable, seconds
 from gns_pyg.tradeoff.job import do
 from gns_pyg.tradeoff.pictures import draw, write_page
 from gns_pyg.tradeoff.points import points
@@ -69,8 +69,11 @@ def collect(cfg: DictConfig) -> list[dict[str, Any]]:
     write_json(path, tables := others | {cfg.experiment: rows})
     with whole(out / "tradeoff_table.md") as temporary:
         temporary.write_text(page(tables), encoding="utf-8")
-    write_figure(draw(rows, cfg.experiment), out / "figures" / f"tradeoff_{cfg.experiment}")
-    write_page(out / "figures" / f"tradeoff_{cfg.experiment}.html", rows, cfg.experiment)
+    if runnable(rows):
+        write_figure(draw(rows, cfg.experiment), out / "figures" / f"tradeoff_{cfg.experiment}")
+        write_page(out / "figures" / f"tradeoff_{cfg.experiment}.html", rows, cfg.experiment)
+    else:
+        log.info("nothing is timed yet, so there is nothing to draw: stage=time")
     for row in front(rows):
         log.info("%.3g s per simulated second: %s; %s", seconds(row), row["name"], "; ".join(told(row)))
     log.info("%d rows -> %s", len(rows), path)

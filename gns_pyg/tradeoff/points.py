@@ -5,6 +5,7 @@ import itertools
 import json
 from collections.abc import Sequence
 from dataclasses import asdict, dataclass
+from functools import cache
 from pathlib import Path
 from typing import Any
 
@@ -137,9 +138,15 @@ def digest(cfg: DictConfig, point: Point) -> str:
 
 def _hashes(scene: Scene, folder: str | None) -> list[str]:
     try:
-        return [Trajectory(path).content_hash() for path in find_cases(scene, folder)]
+        return [_hash(path, path.stat().st_mtime_ns) for path in find_cases(scene, folder)]
     except DataError:  # not there (yet): the job will say so
         return []
+
+
+@cache
+def _hash(path: Path, changed_ns: int) -> str:
+    """Of the content of a file as it was changed last: every point of a table asks for the same few."""
+    return Trajectory(path).content_hash()
 
 
 def as_plain(point: Point) -> dict[str, Any]:
