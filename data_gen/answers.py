@@ -75,7 +75,7 @@ def answers(cfg: DictConfig) -> dict[str, Any]:
 def own_states(simulator: Simulator, case: Trajectory, start: int, every: int) -> list[Start]:
     """States of a roll-out from the recorded frame `start`, every so many steps; if it diverges, those before."""
     state, found = initial_state(simulator, case, start), []
-    steps = rollout(simulator, state.to(simulator.scale.device), case.n_frames - 1 - start, settles=simulator.settles)
+    steps = rollout(simulator, state.to(simulator.scale.device), case.n_frames - 1 - start)
     try:
         for after in islice(steps, every - 1, None, every):
             now = after.to("cpu")
