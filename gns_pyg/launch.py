@@ -32,7 +32,7 @@ def launch(config_name: str, function: Callable[[DictConfig], Any], configs: str
     def job(cfg: DictConfig) -> Any:
         with suppress(ValueError):  # a launcher that runs jobs in threads
             signal.signal(signal.SIGTERM, signal.default_int_handler)  # what a cluster sends: end as on Ctrl-C
-        if "folder" not in cfg or rank():  # of several processes that train together the first one holds it
+        if cfg.get("folder") is None or rank():  # of several processes that train together the first one holds it
             return function(cfg)
         with held(Path(cfg.folder)):
             return function(cfg)

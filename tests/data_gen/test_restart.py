@@ -95,10 +95,8 @@ class TestWithoutYade:
         monkeypatch.delitem(sys.modules, module)
         with pytest.raises(SystemExit) as ended:
             runpy.run_module(module, run_name="__main__")
-        assert ended.value.code == 1
-        told = capsys.readouterr().err
-        assert "remedy" in told
-        assert "Traceback" not in told
+        assert "remedy" in str(ended.value.code)  # a text: Python prints it and ends with status 1
+        assert "Traceback" not in capsys.readouterr().err
 
 
 @pytest.fixture(scope="module")
