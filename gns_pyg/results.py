@@ -14,7 +14,7 @@ import numpy as np
 from gns_pyg import bundle, machine
 from gns_pyg.card import FILE as CARD
 from gns_pyg.card import card_page
-from gns_pyg.data.datamodule import EMBEDDED, find_cases, open_to_compare
+from gns_pyg.data.datamodule import EMBEDDED, find_cases, open_embedded, open_to_compare
 from gns_pyg.data.trajectory import Trajectory
 from gns_pyg.errors import DataError
 from gns_pyg.evaluation.baselines import Climatology
@@ -66,7 +66,7 @@ def results(docs: Path, names: Sequence[str] = tuple(BUNDLES)) -> dict[str, Any]
         conditions = BUNDLES[name]
         simulator, card = bundle.load(name), bundle.card(name)
         scene, expected = simulator.scene, Climatology.from_plain(card["climatology"])
-        known = {case.content_hash(): case for case in open_embedded(scene)}
+        known = {case.content_hash(): case for case in own_cases(scene)}
         unseen = kept_for_testing(known, card)
         log.info("%s: %d unseen cases", name, len(unseen))
         evaluation = judge(simulator, unseen, expected, START_S)
@@ -90,7 +90,7 @@ def results(docs: Path, names: Sequence[str] = tuple(BUNDLES)) -> dict[str, Any]
     return found
 
 
-def open_embedded(scene: Scene) -> list[Trajectory]:
+def own_cases(scene: Scene) -> list[Trajectory]:
     return [open_to_compare(path, scene) for path in find_cases(scene, str(EMBEDDED / scene.name))]
 
 
@@ -123,9 +123,12 @@ def rewrite_pages(docs: Path = DOCS) -> None:
 def held_out(name: str, condition: str, expected: Climatology) -> dict[str, Any]:
     """Metrics of the bundle's networks in a scene that they were never trained on, beside the training cases' mean."""
     log.info("held out: %s", condition)
-    paths = sorted((EMBEDDED / condition).glob("case_*.h5"))
-    scene = replace(Scene.from_config(Trajectory(paths[0]).scene), frame_dt_s=bundle.load(name).scene.frame_dt_s)
-    cases = [open_to_compare(path, scene) for path in paths]
+    found = open_embedded(condition, bundle.load(name).scene.frame_dt_s)
+    if found is None:
+        raise DataError(
+            EMBEDDED / condition, "no cases", "the held-out cases", "python -m data_gen.generate, docs/scenes.md"
+        )
+    scene, cases = found
     return judge(bundle.load(name, scene), cases, expected, START_S).metrics
 
 

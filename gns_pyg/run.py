@@ -204,7 +204,7 @@ def stress(cfg: DictConfig) -> dict[str, Any]:
     else:
         named, remedy = cfg.bundle is not None, "bundle=runs/.../bundle, as train.py prints it"
         require(named, "bundle", "null", "a bundle folder or untrained", remedy)
-        simulator, card = bundle.load(cfg.bundle), bundle.describe(cfg.bundle)["card"]
+        simulator, card = bundle.load(cfg.bundle), bundle.card(cfg.bundle)
         unseen = unseen_cases(simulator.scene, cfg.data.dir, card, None)
         require(bool(unseen), "data.dir", cfg.data.dir, "a case that the bundle has not seen", "generate one more")
         case, covered = unseen[0], card["coverage"]
@@ -453,7 +453,7 @@ def report(
 def cost(cases: Split, training: TrainingConfig, seconds: float, where: torch.device) -> dict[str, Any]:
     """What a bundle has cost: Yade for all it learned from, s, and training, wall s (None where the bundle that it
     started from does not say)."""
-    start = training.start_from and bundle.describe(training.start_from)["card"].get("cost", {"training_s": None})
+    start = training.start_from and bundle.card(training.start_from).get("cost", {"training_s": None})
     earlier = start["training_s"] if start else 0.0
     learned = (*cases.train, *cases.val, *cases.answers)
     return {

@@ -128,6 +128,16 @@ def open_to_compare(path: str | Path, scene: Scene, every_s: float | None = None
     return open_case(path, replace(scene, frame_dt_s=round(steps) * scene.frame_dt_s))
 
 
+def open_embedded(folder: str, frame_dt_s: float) -> tuple[Scene, list[Trajectory]] | None:
+    """The cases of a folder of the embedded data, opened to be compared with a simulator of steps of `frame_dt_s`, and
+    their scene, which is the first one's; None where there is no such folder."""
+    paths = sorted((EMBEDDED / folder).glob("case_*.h5"))
+    if not paths:
+        return None
+    scene = replace(Scene.from_config(Trajectory(paths[0]).scene), frame_dt_s=frame_dt_s)
+    return scene, [open_to_compare(path, scene) for path in paths]
+
+
 def open_cases(scene: Scene, folder: str | None) -> list[Trajectory]:
     """Opens and checks all cases of a scene (see `find_cases`, `open_case`)."""
     return [open_case(path, scene) for path in find_cases(scene, folder)]

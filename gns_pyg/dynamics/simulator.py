@@ -84,7 +84,7 @@ class Simulator(nn.Module):
                 n_sender=n_point, n_receiver=n_grain, n_edge=n_edge, sparse=reachable, **width
             )
         self.passage = Passage(scene) if requires.active_mask else None
-        self.guard = Guard(scene) if scene.boundary else None
+        self.guard = Guard(scene)
 
     def forward(self, state: State) -> State:
         """Moves every grain by one frame."""
@@ -103,8 +103,6 @@ class Simulator(nn.Module):
 
     def guarded(self, before: State, after: State) -> State:
         """`after`, without what went through a wall (see `guard`)."""
-        if self.guard is None:
-            return after
         held = self.guard(before, after)
         if self.requires.state == "differences" and held is not after:
             held = replace(held, vel=(held.pos - before.pos) / self.scene.frame_dt_s)

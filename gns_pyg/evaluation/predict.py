@@ -193,16 +193,15 @@ def _run(simulator: Simulator, state: State, n_frames: int, steps: int, see: Cal
     simulator.check_place(state)
     see(0, state)
     step = Captured(simulator) if simulator.execution.capture else simulator
-    options: dict[str, Any] = dict(settles=simulator.settles, reach_m=simulator.cutoff_m)
-    states, seconds = rollout(step, state.to(simulator.scale.device), n_frames * steps, **options), 0.0
-    if simulator.guard is not None:
-        simulator.guard.reset()
+    state, reach_m = state.to(simulator.scale.device), simulator.cutoff_m
+    states, seconds = rollout(step, state, n_frames * steps, settles=simulator.settles, reach_m=reach_m), 0.0
+    simulator.guard.reset()
     for number in tqdm(range(1, n_frames + 1), desc="roll-out", unit="frame", leave=False, disable=None):
         begin = time.perf_counter()
         following = deque(islice(states, steps), maxlen=1)[0].to("cpu")
         seconds += time.perf_counter() - begin
         see(number, following)
-    if simulator.guard is not None and (first := simulator.guard.first) is not None:
+    if (first := simulator.guard.first) is not None:
         log.warning(
             "%d times a grain would have gone through a wall and was stopped there, first grain %d at %.3g m/s at "
             "t = %.4g s (%s)",

@@ -1,27 +1,23 @@
 """Trained simulators at the extremes: lines that must hold, each a function of a `Bench`, and how they are run."""
 
-import logging
 import time
 import traceback
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from dataclasses import asdict, dataclass, field, replace
+from dataclasses import asdict, dataclass, field
 from functools import cached_property
 from typing import Any
 
 import numpy as np
 import torch
 
-from gns_pyg.data.datamodule import EMBEDDED, open_to_compare
+from gns_pyg.data.datamodule import open_embedded
 from gns_pyg.data.trajectory import Trajectory
 from gns_pyg.dynamics.rollout import rollout
 from gns_pyg.dynamics.simulator import Simulator
 from gns_pyg.errors import GnsError
 from gns_pyg.evaluation.predict import initial_state, start_frame
 from gns_pyg.scene.containment import outside
-from gns_pyg.scene.scene import Scene
 from gns_pyg.state import State
-
-log = logging.getLogger(__name__)
 
 
 @dataclass(frozen=True)
@@ -81,11 +77,9 @@ class Bench:
 
     def recorded(self, kind: str) -> Trajectory | None:
         """The first embedded DEM run of the scene that is `long`, or with walls that are `still`, or None."""
-        paths = embedded(f"{self.simulator.scene.name}_{kind}")
-        if not paths:
-            return None
-        scene = replace(Scene.from_config(Trajectory(paths[0]).scene), frame_dt_s=self.simulator.scene.frame_dt_s)
-        return open_to_compare(paths[0], scene)
+        own = self.simulator.scene
+        found = open_embedded(f"{own.name}_{kind}", own.frame_dt_s)
+        return None if found is None else found[1][0]
 
     def escaped(self, state: State, simulator: Simulator | None = None) -> int:
         """Grains outside the boundary."""
@@ -95,10 +89,6 @@ class Bench:
             pos = state.pos[state.batch == graph]
             found += int(outside(pos[None].numpy(), np.array([time_s]), scene).sum())
         return found
-
-
-def embedded(folder: str) -> list[Any]:
-    return sorted((EMBEDDED / folder).glob("case_*.h5"))
 
 
 def run_lines(
@@ -137,7 +127,11 @@ def finite(state: State) -> bool:
     return all(values is None or bool(torch.isfinite(values).all()) for values in fields)
 
 
+def masses(state: State, density_kg_m3: float) -> torch.Tensor:
+    """Of every grain, kg, (n,)."""
+    return density_kg_m3 * 4 / 3 * torch.pi * state.radius**3
+
+
 def kinetic_energy(state: State, density_kg_m3: float) -> float:
     """Of translation, J."""
-    mass = density_kg_m3 * 4 / 3 * torch.pi * state.radius**3
-    return float((mass * state.vel.square().sum(1) / 2).sum())
+    return float((masses(state, density_kg_m3) * state.vel.square().sum(1) / 2).sum())

@@ -194,15 +194,14 @@ def long_run(bench: Bench) -> Verdict:
     n = round((LONG if bench.full else 0.1) * trained_s / dt_s)
     density, radius = simulator.scene.grains.material.density_kg_m3, bench.start.radius
     every, energies, escaped, overlap = max(1, round(0.05 / dt_s)), [], 0, []
-    if simulator.guard is not None:
-        simulator.guard.reset()
+    simulator.guard.reset()
     for number, after in enumerate(steps(simulator, bench.start, n), 1):
         if number % every == 0:
             energies.append((float(after.time_s[0]), kinetic_energy(after, density)))
             escaped = max(escaped, bench.escaped(after))
             overlap.append(float(mean_overlap_ratio(after.pos[None].numpy(), radius.numpy())[0]))
     times_s, energy = np.array(energies).T if energies else (np.zeros(1), np.zeros(1))
-    crossings = 0 if simulator.guard is None else simulator.guard.crossings
+    crossings = simulator.guard.crossings
     ok, told = escaped == 0, f"{n * dt_s:g} s: finite, {escaped} escaped, {crossings} stopped at walls"
     bench.curves["long"] = {"times_s": times_s.tolist(), "energy_j": energy.tolist()}
     half = len(overlap) // 2
@@ -230,10 +229,9 @@ def tunnelling(bench: Bench) -> Verdict:
         vel = bench.middle.vel.clone()
         vel[: len(directions)] = speed * directions
         state = replace(bench.middle, vel=vel)
-        if simulator.guard is not None:
-            simulator.guard.reset()
+        simulator.guard.reset()
         escaped = max(bench.escaped(after) for after in steps(simulator, state, 40))
-        crossings = 0 if simulator.guard is None else simulator.guard.crossings
+        crossings = simulator.guard.crossings
         ok &= escaped == 0
         told.append(f"{speed:g} m/s: {crossings} stopped at walls, {escaped} through")
     return ok, "; ".join(told)
@@ -253,7 +251,7 @@ def extremes(bench: Bench) -> Verdict:
         warned = outside_coverage(bench.covered, now) if bench.covered else [expected or ""]
         named = expected is None or any(expected in text for text in warned)
         after = last(other, state, n)
-        escaped, stopped = bench.escaped(after, other), 0 if other.guard is None else other.guard.crossings
+        escaped, stopped = bench.escaped(after, other), other.guard.crossings
         ok &= named and escaped == 0 and finite(after)
         text = f"{what}: {escaped} escaped, {stopped} stopped at walls"
         text += "" if expected is None else ", warned" if named else f", NOT warned of {expected}"

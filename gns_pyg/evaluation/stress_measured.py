@@ -12,7 +12,7 @@ from gns_pyg.dynamics.simulator import Simulator
 from gns_pyg.evaluation.contacts import mean_overlap_ratio
 from gns_pyg.evaluation.gradients import gradient_norms
 from gns_pyg.evaluation.predict import initial_state, start_frame, steps_per_frame
-from gns_pyg.evaluation.stress import Bench, Verdict, kinetic_energy, last, steps
+from gns_pyg.evaluation.stress import Bench, Verdict, kinetic_energy, last, masses, steps
 from gns_pyg.evaluation.twins import read_twins
 from gns_pyg.state import State
 
@@ -118,7 +118,7 @@ def _one_step_m(bench: Bench, simulator: Simulator, frames: range, per_frame: in
 def _energy(simulator: Simulator, state: State) -> float:
     """Kinetic energy of translation and rotation, and potential energy of gravity, J."""
     density = simulator.scene.grains.material.density_kg_m3
-    mass = density * 4 / 3 * torch.pi * state.radius**3
+    mass = masses(state, density)
     gravity = torch.tensor(simulator.scene.gravity_m_s2, dtype=torch.float64)
     spin_j = 0.0
     if state.ang_vel is not None:

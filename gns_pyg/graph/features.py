@@ -34,7 +34,7 @@ def grain_edges(
             turning = arm.index_select(0, sender) + arm.index_select(0, receiver)
             slip = rel_vel - torch.linalg.cross(turning, direction)
         ahead = torch.linalg.vector_norm(rel_pos + rel_vel * dt_s, dim=1)
-        features += _contact(distance - touch, ahead - touch, rel_vel, slip, direction, radius, velocity_m_s, dt_s)
+        features += _contact(distance - touch, ahead - touch, rel_vel, slip, direction, radius, velocity_m_s)
     return torch.cat(features, dim=1).to(dtype)
 
 
@@ -55,7 +55,7 @@ def wall_edges(
             arm = state.radius[:, None] * state.ang_vel
             slip = rel_vel + torch.linalg.cross(arm.index_select(0, grain), normal)
         ahead = height - dot(rel_vel, normal) * dt_s
-        features += _contact(height - radius, ahead - radius, rel_vel, slip, -normal, radius, velocity_m_s, dt_s)
+        features += _contact(height - radius, ahead - radius, rel_vel, slip, -normal, radius, velocity_m_s)
     return torch.cat(features, dim=1).to(dtype)
 
 
@@ -97,7 +97,6 @@ def _contact(
     direction: Tensor,
     radius: Tensor,
     velocity_m_s: float,
-    dt_s: float,
 ) -> list[Tensor]:
     approach = dot(rel_vel, direction)[:, None]
     tangential = slip - dot(slip, direction)[:, None] * direction

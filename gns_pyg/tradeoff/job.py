@@ -147,7 +147,7 @@ def simulator_of(cfg: DictConfig, point: Point) -> Simulator:
 def judged(cfg: DictConfig, point: Point) -> dict[str, Any]:
     """The figures of a point's row."""
     torch.set_num_threads(1)
-    simulator, card = simulator_of(cfg, point), bundle.describe(bundle_of(cfg, point))["card"]
+    simulator, card = simulator_of(cfg, point), bundle.card(bundle_of(cfg, point))
     scene = replace(scene_of(cfg), frame_dt_s=simulator.scene.frame_dt_s)
     paths = [case.path for case in run.unseen_cases(scene, cfg.data.dir, card, None)]
     cases = [open_to_compare(path, scene) for path in paths]

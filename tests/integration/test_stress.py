@@ -2,6 +2,7 @@
 
 import json
 import re
+from dataclasses import replace
 from pathlib import Path
 
 import pytest
@@ -9,6 +10,7 @@ from hydra import compose, initialize_config_dir
 
 from gns_pyg import bundle, run, stability
 from gns_pyg.config import CONF
+from gns_pyg.dynamics.guard import Guard
 from gns_pyg.errors import NumericalError
 from gns_pyg.evaluation.stress import Bench, run_lines
 from gns_pyg.evaluation.stress_hard import HARD
@@ -62,7 +64,10 @@ def verdict(name, one):
 @pytest.mark.parametrize(
     ("line", "spoil"),
     [
-        ("grains up to 100 m/s", lambda simulator: setattr(simulator, "guard", None)),
+        (
+            "grains up to 100 m/s",
+            lambda simulator: setattr(simulator, "guard", Guard(replace(simulator.scene, boundary={}))),
+        ),
         ("other units", lambda simulator: setattr(simulator.statistics, "correction", [1.0, 1.0])),
     ],
 )
