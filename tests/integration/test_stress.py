@@ -61,6 +61,10 @@ def verdict(name, one):
     return line
 
 
+def unguarded(simulator):
+    simulator.guard = Guard(replace(simulator.scene, boundary={}))
+
+
 @pytest.mark.parametrize(
     ("line", "spoil"),
     [
