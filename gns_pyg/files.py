@@ -100,10 +100,14 @@ def held(folder: Path, item: int | None = None, waiting: Callable[[], None] | No
 
 
 def _runs(pid: int) -> bool:
+    """Whether there is such a process; one that has ended and that nobody has waited for yet is none."""
     try:
         os.kill(pid, 0)
     except ProcessLookupError:
         return False
     except PermissionError:
         pass
+    stat = Path(f"/proc/{pid}/stat")
+    with suppress(OSError):
+        return stat.read_text().rpartition(")")[2].split()[0] != "Z"
     return True

@@ -81,6 +81,14 @@ class TestWithoutYade:
         clean_stale(tmp_path / "case_000.h5")
         assert names(tmp_path) == sorted([mine, theirs, f".case_001.h5.{HOST}.{ended.pid}.part"])
 
+    def test_unfinished_files_of_processes_that_nobody_has_waited_for_go(self, tmp_path) -> None:
+        ended = subprocess.Popen(["true"])
+        os.waitid(os.P_PID, ended.pid, os.WEXITED | os.WNOWAIT)  # it is a zombie from here on
+        (tmp_path / f".case_000.h5.{HOST}.{ended.pid}.part").touch()
+        clean_stale(tmp_path / "case_000.h5")
+        assert names(tmp_path) == []
+        ended.wait()
+
     def test_a_user_error_is_printed_without_traceback(self, tmp_path) -> None:
         done = run(tmp_path, "scene.initial.z_min_m=9.0")
         assert done.returncode == 1
