@@ -11,6 +11,7 @@ from typing import Any
 import h5py
 import numpy as np
 
+from gns_pyg.data.heap import endless_heap
 from gns_pyg.data.schema import FIXED_UNITS, GRAINS, H5MD_VERSION, RUN_KEYS, UNITS, violations
 from gns_pyg.errors import DataError, StorageError
 from gns_pyg.files import REMEDY, clean_stale, remove, unfinished
@@ -46,6 +47,8 @@ class Trajectory:
                 self.path, "no such file", "a trajectory file (.h5)", "generate it: python -m data_gen.generate"
             )
         try:
+            if endless := endless_heap(self.path):
+                raise OSError(endless)
             with h5py.File(self.path, "r") as file:
                 wrong = violations(file)
                 if not wrong:

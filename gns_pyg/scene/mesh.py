@@ -178,7 +178,7 @@ def build_mesh(name: str, part: Part) -> Trimesh:
     where = f"scene.boundary.{name}.shape"
     shape = dict(part.shape)
     kind = shape.pop("kind", None)
-    require(kind in SHAPES, f"{where}.kind", kind, " or ".join(SHAPES), "pick one of them")
+    require(isinstance(kind, str) and kind in SHAPES, f"{where}.kind", kind, " or ".join(SHAPES), "pick one of them")
     record: Any = typed(SHAPES[kind], shape, where)
     mesh: Trimesh = record.mesh(where)
     if mesh.is_watertight and mesh.volume < 0:

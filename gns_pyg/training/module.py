@@ -113,9 +113,9 @@ class TrainingModule(pl.LightningModule):
         found: dict[str, Any] = dict(checkpoint["state_dict"])
         (optimizer,) = checkpoint["optimizer_states"]
         for number, parameter in enumerate(self.simulator.parameters()):
-            for name in ("exp_avg", "exp_avg_sq"):
+            for name, like in {"exp_avg": parameter, "exp_avg_sq": parameter, "step": torch.zeros(())}.items():
                 if number in optimizer["state"]:
-                    expected[f"{name} {number}"] = parameter
+                    expected[f"{name} {number}"] = like
                     found[f"{name} {number}"] = optimizer["state"][number][name]
         for key in sorted({*expected, *found}, key=str):
             ours, theirs = expected.get(key), found.get(key)

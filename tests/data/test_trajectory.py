@@ -217,6 +217,17 @@ def test_a_truncated_file_is_refused(good, share) -> None:
         Trajectory(good)
 
 
+def test_a_heap_on_which_the_hdf5_library_never_ends_is_refused_unread(good) -> None:
+    content = bytearray(good.read_bytes())
+    place = content.index(b"GCOL") + 16
+    while content[place : place + 2] != b"\0\0":  # object 0 is the heap's free space
+        place += 16 + -(-int.from_bytes(content[place + 8 : place + 16], "little") // 8) * 8
+    content[place + 8 : place + 16] = bytes(8)
+    good.write_bytes(content)
+    with pytest.raises(DataError, match="free space of size 0"):
+        Trajectory(good)
+
+
 def test_a_missing_file_names_the_command_that_makes_it(tmp_path) -> None:
     with pytest.raises(DataError, match=r"data_gen\.generate"):
         Trajectory(tmp_path / "nothing.h5")

@@ -9,6 +9,8 @@ import time
 from pathlib import Path
 from typing import Any
 
+import torch
+
 from gns_pyg.evaluation.metrics import write_json
 from tests.faults import kills, mutations, samples
 from tests.faults.page import PAGE, RESULT, with_figures
@@ -50,5 +52,6 @@ def record(part: str, name: str, entry: dict[str, Any]) -> None:
 
 
 if __name__ == "__main__":
+    torch.set_num_threads(1)  # forks have none of their parent's threads and would wait for them for ever
     with tempfile.TemporaryDirectory() as place:
         main(Path(place), sys.argv[1:])

@@ -195,6 +195,7 @@ def test_an_open_surface_has_no_inside_and_the_error_counts_its_open_edges(tmp_p
     [
         ({}, "shape.kind"),
         ({"kind": "sphere"}, "shape.kind"),
+        ({"kind": ["box"]}, "shape.kind"),
         ({"kind": "cylinder", "radius_m": 1.0}, "shape.length_m"),
         ({"kind": "cylinder", "radius_m": 1.0, "length_m": 1.0, "radios_m": 2.0}, "shape.radios_m"),
         ({"kind": "cylinder", "radius_m": -1.0, "length_m": 1.0}, "shape.radius_m"),
