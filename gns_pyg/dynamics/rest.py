@@ -1,8 +1,9 @@
 """A grain that stands stays: what static friction does in the DEM, and what a network that is never quite exact undoes.
 
-A grain that nothing holds gains, in one step, the speed of free flight from rest. One that was slower than a small part
-of that, and that the step leaves slower than it, is held by its contacts: it is left where it is. Only scenes whose
-walls all stand have such a rest (see `scene.requirements`); without gravity no grain is slow by this measure.
+A grain that nothing holds gains, in one step, the velocity of free flight from rest. One that the step moves by less
+than a small part of where that would carry it, and that is slower than half of it before and after, is held by its
+contacts: it is left where it is. (In free flight it cannot be slower than that half both before and after.) Only scenes
+whose walls all stand have such a rest (see `scene.requirements`); without gravity no grain is slow by this measure.
 """
 
 from dataclasses import replace
@@ -13,19 +14,23 @@ from torch import Tensor
 
 from gns_pyg.state import State
 
-REST = 0.15  # of the speed that a step of free flight gives a standing grain
+REST = 0.15  # of the way that the speed of a step of free flight from rest would carry a grain
 
 
-def rested(before: State, after: State, gained_m_s: Float[Tensor, " n_grains"]) -> State:
-    """`after`, with every grain at rest that stood before and hardly moved.
+def rested(before: State, after: State, gained_m_s: Float[Tensor, " n_grains"], dt_s: float) -> State:
+    """`after`, with every grain at rest that hardly moved.
+
+    What a network says of positions and velocities is not quite consistent: a grain may stay in its place for ever and
+    keep a velocity of some mm/s. The place decides.
 
     Args:
         before, after: the step.
         gained_m_s: speed of each grain after a step of free flight from rest.
+        dt_s: the step.
     """
-    slow = REST * gained_m_s
-    stands = _speed(before) < slow
-    stands &= _speed(after) < slow
+    stands = torch.linalg.vector_norm(after.pos - before.pos, dim=1) < REST * gained_m_s * dt_s
+    for state in (before, after):
+        stands &= torch.linalg.vector_norm(state.vel, dim=1) < gained_m_s / 2
     rows = stands[:, None]
     still = torch.zeros_like(after.vel)
     return replace(
@@ -34,7 +39,3 @@ def rested(before: State, after: State, gained_m_s: Float[Tensor, " n_grains"]) 
         vel=torch.where(rows, still, after.vel),
         ang_vel=None if after.ang_vel is None else torch.where(rows, still, after.ang_vel),
     )
-
-
-def _speed(state: State) -> Float[Tensor, " n_grains"]:
-    return torch.linalg.vector_norm(state.vel, dim=1)

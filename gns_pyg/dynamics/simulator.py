@@ -98,7 +98,7 @@ class Simulator(nn.Module):
         if self.requires.rest:
             still = torch.zeros_like(state.vel)
             gained = self.integrator.without_contact(replace(state, vel=still)).vel
-            after = rested(state, after, torch.linalg.vector_norm(gained, dim=1))
+            after = rested(state, after, torch.linalg.vector_norm(gained, dim=1), self.scene.frame_dt_s)
         return after if self.passage is None else self.passage(state, after)
 
     def guarded(self, before: State, after: State) -> State:

@@ -4,6 +4,7 @@ from dataclasses import replace
 
 import torch
 
+from gns_pyg.dynamics.rest import rested
 from gns_pyg.dynamics.rollout import rollout
 from tests import scenes, simulators
 
@@ -62,3 +63,24 @@ def test_nothing_moves_nothing_is_recomputed():
     assert len(calls) == 1
     assert torch.equal(states[-1].pos, state.pos)
     torch.testing.assert_close(states[-1].time_s, state.time_s + 30 * 0.01)
+
+
+def test_a_grain_that_keeps_its_place_keeps_no_velocity():
+    """As the shipped hopper's would: its networks are not quite of one mind about places and velocities."""
+    state = standing()
+    trembling = replace(state, vel=state.vel + 0.02)
+    gained_m_s = torch.full((8,), 0.098, dtype=torch.float64)
+    after = rested(trembling, replace(trembling, pos=state.pos + 1e-6), gained_m_s, 0.01)
+    assert torch.equal(after.pos, state.pos)
+    assert torch.equal(after.vel, state.vel)
+
+
+def test_no_grain_in_free_flight_is_held_not_even_at_the_top():
+    model = simulators.simulator(scenes.scene(8, 5))
+    model.correction = lambda state: torch.zeros(len(state.pos), len(model.scale))
+    state = standing(400)
+    state.vel[:, 2] = torch.linspace(-0.2, 0.2, 400, dtype=torch.float64)
+    after = model(state)
+    held = (after.pos == state.pos).all(dim=1)
+    assert model.requires.rest
+    assert not held.any()
