@@ -42,8 +42,10 @@ def search(cfg: DictConfig) -> list[dict[str, Any]]:
         from optuna.storages.journal import JournalFileBackend
     except ImportError:
         raise DependencyError("stage=search", "no optuna", "Optuna", "pip install 'gns_pyg[optuna]'") from None
-    space = {key: sweep_values(key, values) for key, values in plain(cfg.search).items()}
-    require(bool(space), "search", space, "keys of train.py, each with its values", "see conf/tradeoff/tradeoff.yaml")
+    told_space = [str(text).partition("=") for text in plain(cfg.search)]
+    space = {key: sweep_values(key, values) for key, _, values in told_space}
+    known = bool(space) and all(len(values) > 1 for values in space.values())
+    require(known, "search", cfg.search, "key=value,value,... of train.py", "see conf/tradeoff/tradeoff.yaml")
     optuna.logging.set_verbosity(optuna.logging.WARNING)
     path = Path(cfg.results) / "optuna.log"
     path.parent.mkdir(parents=True, exist_ok=True)
