@@ -7,8 +7,8 @@ from optuna.storages.journal import JournalFileBackend
 
 from gns_pyg.errors import ConfigError
 from gns_pyg.evaluation.metrics import write_json
-from gns_pyg.tradeoff.job import do, folder_of
-from gns_pyg.tradeoff.points import Point
+from gns_pyg.tradeoff.job import folder_of
+from gns_pyg.tradeoff.points import Point, as_plain
 from gns_pyg.tradeoff.search import search
 from tests.tradeoff.samples import TINY, config
 
@@ -41,11 +41,13 @@ def trained(trials):
 def test_what_the_table_holds_is_told_first(tmp_path):
     cfg = config(tmp_path, *TINY, *SPACE, "trials=0")
     point = Point("trained", ("requires.state=velocity",))
-    assert do(cfg, point)["error"] is None
+    case = {"test/center_of_mass_error_max_m": 0.01, "test/angle_of_repose_error_deg": 1.0}
+    folder_of(cfg, point).mkdir(parents=True)
+    write_json(folder_of(cfg, point) / "row.json", as_plain(point) | {"error": None, "cases": [case]})
     write_json(folder_of(cfg, point) / "time.json", {"cpu_s_per_simulated_s": 0.5})
     search(cfg)
     (trial,) = studied(tmp_path)
-    assert trial.values[0] == 0.5
+    assert trial.values == [0.5, 0.01, 1.0]
     assert trial.user_attrs["name"] == point.name
 
 
