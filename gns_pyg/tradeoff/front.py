@@ -46,11 +46,24 @@ def yardstick(rows: Sequence[Row], kind: str) -> Row | None:
     return next((row for row in rows if row["kind"] == kind and row["error"] is None), None)
 
 
-def within_scatter(row: Row, rows: Sequence[Row], axes: Sequence[str] = OBSERVABLES) -> bool:
-    """Whether a row's mean error is, on all `axes`, at most what another DEM seed's is: nobody can tell it from DEM by
-    one run."""
+def scatter(rows: Sequence[Row], axes: Sequence[str]) -> dict[str, float]:
+    """Axis -> the largest difference between two DEM seeds; what a row that is as near as that cannot be told from.
+    Empty without a row of seeds."""
     seeds = yardstick(rows, "seeds")
-    return seeds is not None and all(error(row, a) <= error(seeds, a) for a in axes if a in seeds["axes"])
+    return {} if seeds is None else {axis: seeds["axes"][axis]["most"] for axis in axes if axis in seeds["axes"]}
+
+
+def within_scatter(row: Row, rows: Sequence[Row], axes: Sequence[str] = OBSERVABLES) -> bool:
+    """Whether a row's mean error is, on all `axes`, within what DEM seeds differ by: nobody can tell it from DEM by one
+    run."""
+    known = scatter(rows, axes)
+    return bool(known) and all(error(row, axis) <= limit for axis, limit in known.items())
+
+
+def best_network(rows: Sequence[Row]) -> Row | None:
+    """The fastest network whose centre of mass and angle of repose are within what DEM seeds differ by."""
+    networks = [row for row in runnable(rows) if row["kind"] != "yade" and within_scatter(row, rows, OBSERVED)]
+    return min(networks, key=seconds, default=None)
 
 
 def equivalent_yade(rows: Sequence[Row]) -> Row | None:
@@ -95,8 +108,8 @@ def choose(rows: Sequence[Row], simulated_s: float, max_seconds: float | None, m
 
     Returns:
         With limits on errors: the fastest row within all limits. Without: the most accurate one within the time, by
-        the largest of its errors in centre of mass and angle of repose over another DEM seed's; among rows within that
-        scatter, which nobody can tell apart, the fastest. None if no row is within the limits.
+        the largest of its errors in centre of mass and angle of repose over what DEM seeds differ by; among rows within
+        that scatter, which nobody can tell apart, the fastest. None if no row is within the limits.
 
     Raises:
         ConfigError: without any limit, or for an axis that does not exist.
@@ -117,8 +130,6 @@ def choose(rows: Sequence[Row], simulated_s: float, max_seconds: float | None, m
 
 
 def score(row: Row, rows: Sequence[Row]) -> float:
-    """The larger of a row's errors in centre of mass and angle of repose, over another DEM seed's."""
-    seeds = yardstick(rows, "seeds")
-    if seeds is None:
-        return error(row, OBSERVED[0])
-    return max(error(row, axis) / error(seeds, axis) for axis in OBSERVED if axis in seeds["axes"])
+    """The larger of a row's errors in centre of mass and angle of repose, over what DEM seeds differ by."""
+    known = scatter(rows, OBSERVED)
+    return max((error(row, axis) / limit for axis, limit in known.items()), default=error(row, OBSERVED[0]))

@@ -2,7 +2,7 @@
 
 import json
 import logging
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
@@ -12,7 +12,7 @@ from gns_pyg import machine
 from gns_pyg.config import plain, require
 from gns_pyg.errors import DataError
 from gns_pyg.tradeoff.axes import AXES
-from gns_pyg.tradeoff.front import OBSERVABLES, Row, choose, equivalent_yade, error, seconds
+from gns_pyg.tradeoff.front import OBSERVABLES, Row, choose, equivalent_yade, error, scatter, seconds
 
 log = logging.getLogger(__name__)
 
@@ -118,6 +118,5 @@ def told(row: Row) -> list[str]:
 
 
 def outside(row: Row, rows: Sequence[Row]) -> list[str]:
-    """The observables in which a row's error is larger than another seed's."""
-    seeds: Mapping[str, Any] = next((r for r in rows if r["kind"] == "seeds"), {"axes": {}})
-    return [AXES[a].title for a in OBSERVABLES if a in seeds["axes"] and error(row, a) > error(seeds, a)]
+    """The observables in which a row's error is larger than what DEM seeds differ by."""
+    return [AXES[axis].title for axis, limit in scatter(rows, OBSERVABLES).items() if error(row, axis) > limit]

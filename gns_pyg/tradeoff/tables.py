@@ -5,14 +5,14 @@ from collections.abc import Mapping, Sequence
 from typing import Any
 
 from gns_pyg.tradeoff.axes import AXES
-from gns_pyg.tradeoff.front import Row, equivalent_yade, error, runnable, seconds
+from gns_pyg.tradeoff.front import Row, best_network, equivalent_yade, error, runnable, seconds
 
 HEAD = """# Trade-off: every row
 
 Written by `python tradeoff.py experiment=... stage=table out=docs` from [tradeoff.json](tradeoff.json);
 [tradeoff.md](tradeoff.md) says what it means. Means over the unseen cases, the range over them in brackets. Seconds are
 processor seconds per simulated second on one thread, medians. **F**: on the front of time, centre of mass and angle of
-repose. **=**: all observables within what another DEM seed differs by.
+repose. **=**: all observables within what DEM seeds differ by (the largest difference between two of them).
 """
 
 
@@ -46,7 +46,21 @@ def _about(rows: Sequence[Row]) -> list[str]:
         f"{len(networks)} trained points, {networks[0]['budget_cpu_s'] if networks else 0:g} s of processor time each, "
         f"on one thread of {' or '.join(sorted(processors)) or 'a machine that was not asked (no times)'}.",
         f"Yade's largest step that shows the same: {said if yade is None else yade['name']}.",
+        f"Fastest network whose centre of mass and angle of repose are within what seeds differ by: {_headline(rows)}.",
     ]
+
+
+def _headline(rows: Sequence[Row]) -> str:
+    best = best_network(rows)
+    if best is None:
+        return "none"
+    steps = [row for row in runnable(rows) if row["kind"] == "yade"]
+    paper = min(steps, key=lambda row: row["dt_s"], default=None)
+    beside = [row for row in (equivalent_yade(rows), paper) if row is not None]
+    factors = [f"{seconds(row) / seconds(best):.3g} times as fast as {row['name']}" for row in beside]
+    pays = best.get("break_even_rollouts")
+    told = "what its training cost is not known" if pays is None else f"it pays after {pays} roll-outs"
+    return ", ".join([best["name"], *factors, told if pays != "never" else "so it never pays"])
 
 
 def _cells(row: Row) -> list[str]:

@@ -7,7 +7,16 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from gns_pyg.errors import ConfigError
-from gns_pyg.tradeoff.front import break_even, choose, equivalent_yade, error, front, seconds, within_scatter
+from gns_pyg.tradeoff.front import (
+    best_network,
+    break_even,
+    choose,
+    equivalent_yade,
+    error,
+    front,
+    seconds,
+    within_scatter,
+)
 from tests.tradeoff.samples import row, seeds, yade
 
 FEW = st.sampled_from([0.1, 0.2, 0.5, 1.0, 2.0])
@@ -47,6 +56,19 @@ def test_the_equivalent_step_is_the_last_before_the_first_that_leaves_the_scatte
 def test_within_scatter_asks_all_observables():
     assert within_scatter(row("a", 1, 0.02, 2.0), [seeds()])
     assert not within_scatter(row("a", 1, 0.02, 2.1), [seeds()])
+
+
+def test_the_scatter_is_the_largest_difference_between_two_seeds():
+    other = seeds(0.02)
+    other["axes"]["center_of_mass_error_m"]["most"] = 0.03
+    assert within_scatter(row("a", 1, 0.03, 2.0), [other])
+    assert not within_scatter(row("a", 1, 0.031, 2.0), [other])
+
+
+def test_the_best_network_is_the_fastest_that_no_one_can_tell_from_dem():
+    rows = [seeds(), yade(1e-4, 0.1, 0.005), row("fast", 0.2, 0.2, 9.0), row("b", 3.0, 0.019, 1.0), row("a", 2.0, 0.02)]
+    assert best_network(rows)["name"] == "a"
+    assert best_network(rows[:3]) is None
 
 
 def test_break_even_counts_cases_and_training_against_what_a_roll_out_saves():

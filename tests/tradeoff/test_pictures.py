@@ -33,3 +33,7 @@ def test_the_table_has_every_row_and_says_why_one_failed():
     assert "| F | width </script> 16 | 0.5 |" in text
     assert "- failed: failed. it broke" in text
     assert "Yade's largest step that shows the same: Yade, dt = 0.0001 s." in text
+    assert "within what seeds differ by: none." in text
+    near = [*ROWS, row("near", 1.0, 0.005, 0.5, front=True, budget_cpu_s=100, break_even_rollouts="never")]
+    assert "differ by: near, 2 times as fast as Yade, dt = 0.0001 s" in page({"hopper": near})
+    assert "so it never pays." in page({"hopper": near})
