@@ -31,7 +31,7 @@ YARDSTICKS = {  # kind -> line style, colour, in words
 
 def draw(rows: Sequence[Row], scene: str) -> Figure:
     """Every axis of accuracy against processor seconds per simulated second, both logarithmic; bars from the least to
-    the most accurate case, the front of time and that axis joined, yardsticks across."""
+    the most accurate case, the front of time and that axis joined, yardsticks across, what seeds differ by shaded."""
     shown = [axis for axis in AXES if any(math.isfinite(error(row, axis)) for row in runnable(rows))]
     columns = 2
     figure = Figure(figsize=(11, 3.6 * math.ceil(len(shown) / columns) + 0.8), layout="constrained")
@@ -72,6 +72,9 @@ def _panel(axes: Axes, rows: Sequence[Row], axis: str) -> None:
         row = next((row for row in rows if row["kind"] == kind and axis in row["axes"]), None)
         if row is not None and error(row, axis) > 0:
             axes.axhline(factor * error(row, axis), linestyle=style, color=color, linewidth=1, label=label)
+            if kind == "seeds":
+                ends = (factor * row["axes"][axis][end] for end in ("least", "most"))
+                axes.axhspan(*ends, color=color, alpha=0.12, linewidth=0, label="what seeds differ by")
     axes.set_xscale("log")
     axes.set_yscale("symlog", linthresh=1) if axis == "escaped_grains" else axes.set_yscale("log")
     axes.set_xlabel("processor seconds per simulated second", fontsize=8)
