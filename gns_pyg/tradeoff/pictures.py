@@ -14,6 +14,7 @@ from gns_pyg.report.plots import BLUE, GREEN, ORANGE, PURPLE, VERMILION
 from gns_pyg.tradeoff.axes import AXES
 from gns_pyg.tradeoff.front import RUNS, Row, equivalent_yade, error, front, runnable, seconds
 
+GREY = "#4d4d4d"
 PAGE = Path(__file__).with_name("page.html")
 STYLES = {  # kind -> marker, colour, in words
     "trained": ("o", BLUE, "networks, equal budget"),
@@ -24,8 +25,8 @@ STYLES = {  # kind -> marker, colour, in words
 YARDSTICKS = {  # kind -> line style, colour, in words
     "twins": ("--", GREEN, "DEM twins"),
     "seeds": ("-", GREEN, "another DEM seed"),
-    "climatology": (":", "0.3", "climatology"),
-    "trivial": ("-.", "0.3", "best trivial step"),
+    "climatology": (":", GREY, "climatology"),
+    "trivial": ("-.", GREY, "best trivial step"),
 }
 
 

@@ -2,7 +2,7 @@
 
 import re
 
-from gns_pyg.tradeoff.pictures import draw, write_page
+from gns_pyg.tradeoff.pictures import STYLES, YARDSTICKS, draw, write_page
 from gns_pyg.tradeoff.tables import page
 from tests.tradeoff.samples import row, seeds, yade
 
@@ -37,3 +37,9 @@ def test_the_table_has_every_row_and_says_why_one_failed():
     near = [*ROWS, row("near", 1.0, 0.005, 0.5, front=True, budget_cpu_s=100, break_even_rollouts="never")]
     assert "differ by: near, 2 times as fast as Yade, dt = 0.0001 s" in page({"hopper": near})
     assert "so it never pays." in page({"hopper": near})
+
+
+def test_every_colour_is_one_that_browsers_know():
+    assert all(
+        re.fullmatch("#[0-9a-f]{6}", color, re.IGNORECASE) for _, color, _ in (*STYLES.values(), *YARDSTICKS.values())
+    )
