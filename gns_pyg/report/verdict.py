@@ -13,8 +13,8 @@ MARKS = {True: "holds", False: "FAILS", None: "-"}
 
 
 def mark(line: Line) -> str:
-    """holds, FAILS, a figure without a mark (`-`), or `not run`."""
-    return "not run" if line.hard and line.holds is None else MARKS[line.holds]
+    """holds, FAILS, a figure without a mark (`-`), or `no mark` (found says why)."""
+    return "no mark" if line.hard and line.holds is None else MARKS[line.holds]
 
 
 def verdict_table(lines: Sequence[Line], title: str, places: Mapping[str, object]) -> str:
