@@ -26,6 +26,7 @@ from gns_pyg.evaluation.observables import angle_of_repose, escaped_grains, from
 from gns_pyg.evaluation.predict import roll_out, start_frame
 from gns_pyg.report.plots import draw, ensemble_spread
 from gns_pyg.report.results_page import results_page
+from gns_pyg.run import seen
 from gns_pyg.scene.scene import Scene
 
 BUNDLES = {  # what ships -> conditions it was never trained on
@@ -66,8 +67,8 @@ def results(docs: Path, names: Sequence[str] = tuple(BUNDLES)) -> dict[str, Any]
         conditions = BUNDLES[name]
         simulator, card = bundle.load(name), bundle.card(name)
         scene, expected = simulator.scene, Climatology.from_plain(card["climatology"])
-        known = {case.content_hash(): case for case in own_cases(scene)}
-        unseen = kept_for_testing(known, card)
+        own = own_cases(scene)
+        unseen = kept_for_testing(own, scene, card)
         log.info("%s: %d unseen cases", name, len(unseen))
         evaluation = judge(simulator, unseen, expected, START_S)
         pictures(evaluation, replace(scene, frame_dt_s=unseen[0].frame_dt_s), docs / "figures", name)
@@ -80,7 +81,7 @@ def results(docs: Path, names: Sequence[str] = tuple(BUNDLES)) -> dict[str, Any]
             "spread": spread(evaluation.per_case),
             "cases": evaluation.per_case,
             "trained_on": len(card["cases"]["train"]),
-            "seed_scatter": seed_scatter(list(known.values()), scene),
+            "seed_scatter": seed_scatter(own, scene),
             "ensemble": {key: value for key, value in ensemble.plain().items() if key != "observables"},
             "long": long_runs(name, scene),
             "held_out": {condition: held_out(name, condition, expected) for condition in conditions},
@@ -94,17 +95,19 @@ def own_cases(scene: Scene) -> list[Trajectory]:
     return [open_to_compare(path, scene) for path in find_cases(scene, str(EMBEDDED / scene.name))]
 
 
-def kept_for_testing(known: Mapping[str, Trajectory], card: Mapping[str, Any]) -> list[Trajectory]:
-    """The cases (content hash -> case) that a bundle kept for testing.
+def kept_for_testing(cases: Sequence[Trajectory], scene: Scene, card: Mapping[str, Any]) -> list[Trajectory]:
+    """The cases that a bundle kept for testing. They may be recorded at other frames here than where it was trained,
+    so they are those that it has not seen, neither their content nor their first frame.
 
     Raises:
-        DataError: if one of them is not there: figures of other data must not stand in its place.
+        DataError: if these are others than its card names: figures of other data must not stand in their place.
     """
-    for file, digest in card["cases"]["test"].items():
-        if digest not in known:
-            found, remedy = f"no case of the hash {digest}", "fetch the data that the bundle was trained beside"
-            raise DataError(file, found, "the run that the bundle kept for testing", remedy)
-    return [known[digest] for digest in card["cases"]["test"].values()]
+    unseen = [case for case in cases if not seen(case, scene, card)]
+    names, expected = [case.path.name for case in unseen], sorted(card["cases"]["test"])
+    if names != expected:
+        found, remedy = f"unseen cases {names}", "fetch the data that the bundle was trained beside"
+        raise DataError(f"cases of {scene.name}", found, f"those that the bundle kept: {expected}", remedy)
+    return unseen
 
 
 def write_pages(docs: Path, found: Mapping[str, Any]) -> None:
@@ -147,10 +150,10 @@ def long_runs(name: str, scene: Scene) -> dict[str, Any]:
         times_s, pos = case.times_s[start:], roll_out(simulator, case, start)[0]
         half = len(times_s) // 2
         entry: dict[str, Any] = {"escaped_grains": int(escaped_grains(pos, times_s, scene).max())}
-        for suffix, seen in (("", pos), ("_dem", positions(case, start))):
-            angle, error = time_mean(angle_of_repose(seen, scene)[from_frame(times_s, scene) :])
+        for suffix, where in (("", pos), ("_dem", positions(case, start))):
+            angle, error = time_mean(angle_of_repose(where, scene)[from_frame(times_s, scene) :])
             entry |= {f"angle_of_repose{suffix}_deg": angle, f"angle_of_repose{suffix}_standard_error_deg": error}
-            entry[f"late_mean_speed{suffix}_m_s"] = nanmean(mean_speed(seen, times_s)[half:])
+            entry[f"late_mean_speed{suffix}_m_s"] = nanmean(mean_speed(where, times_s)[half:])
         cases.append(entry)
     return {"duration_s": float(times_s[-1]), "cases": cases}
 

@@ -3,6 +3,7 @@
 import itertools
 import logging
 import warnings
+from collections.abc import Mapping
 from dataclasses import asdict, replace
 from importlib.metadata import version
 from pathlib import Path
@@ -246,7 +247,7 @@ def unseen_cases(scene: Scene, folder: str | None, card: dict[str, Any], every_s
     return [case for case in cases if not seen(case, scene, card)]
 
 
-def seen(case: Trajectory, scene: Scene, card: dict[str, Any]) -> bool:
+def seen(case: Trajectory, scene: Scene, card: Mapping[str, Any]) -> bool:
     """Whether a bundle was trained or validated on a case."""
     digests = {digest for purpose in ("train", "val") for digest in card["cases"][purpose].values()}
     starts = [np.array(start) for start in card.get("starts", [])]  # bundles made before have none

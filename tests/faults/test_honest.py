@@ -6,16 +6,15 @@ import sys
 import pytest
 import torch
 
-from gns_pyg import run
+from gns_pyg import bundle, run
 from gns_pyg.data.datamodule import DataConfig, split
 from gns_pyg.data.statistics import measure
-from gns_pyg.data.trajectory import Trajectory
 from gns_pyg.dynamics.integrator import Integrator
 from gns_pyg.errors import ConfigError, DataError
 from gns_pyg.evaluation.judge import judge
 from gns_pyg.evaluation.metrics import write_json
 from gns_pyg.evaluation.twins import read_twins, twins_path
-from gns_pyg.results import kept_for_testing
+from gns_pyg.results import BUNDLES, kept_for_testing, own_cases
 from gns_pyg.scene.scene import Scene
 from tests.faults import samples
 
@@ -82,12 +81,13 @@ def test_twins_of_another_run_are_refused(data):
         read_twins(second, second.times_s)
 
 
-def test_results_are_those_of_the_runs_kept_for_testing_whatever_their_names(data):
-    cases = {case.content_hash(): case for case in map(Trajectory, sorted(data.glob("case_*.h5")))}
-    digest = next(iter(cases))
-    assert kept_for_testing(cases, {"cases": {"test": {"renamed.h5": digest}}}) == [cases[digest]]
-    with pytest.raises(DataError, match=r"case_000\.h5[\s\S]*no case of the hash 0123"):
-        kept_for_testing(cases, {"cases": {"test": {"case_000.h5": "0123"}}})
+@pytest.mark.parametrize("name", BUNDLES)
+def test_results_are_those_of_the_runs_that_a_bundle_kept_for_testing(name):
+    scene, card = bundle.load(name).scene, bundle.card(name)
+    cases = own_cases(scene)
+    assert [case.path.name for case in kept_for_testing(cases, scene, card)] == sorted(card["cases"]["test"])
+    with pytest.raises(DataError, match="those that the bundle kept"):
+        kept_for_testing(cases[:-1], scene, card)
 
 
 def test_resuming_with_other_data_is_refused_and_the_difference_named(data, tmp_path):
