@@ -89,6 +89,8 @@ def test_the_page_shows_what_was_found():
     page = (DOCS / "stability.md").read_text()
     assert stability.with_tables(page, found) == page
     assert set(re.findall(r"<!-- end of (\w+) -->", page)) == set(found)
+    assert {"hopper", "drum"} <= {*found}
     for name, entry in found.items():
+        assert entry["form"] == "full"
         assert {line["line"] for line in entry["lines"]} <= {*HARD, *MEASURED}
         assert not [line for line in entry["lines"] if line["holds"] is False], name
