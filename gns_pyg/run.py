@@ -442,7 +442,7 @@ def report(
     names = ", ".join(case.path.stem for case in cases)
     what = f"{names} ({'unseen' if unseen else 'which the model was trained or validated on'})"
     title = f"{scene.name}: {what} from {cfg.start_s:g} s on"
-    model = Model(str(bundle_name), simulator.requires, card, read_stability(bundle_folder, card))
+    model = Model(str(bundle_name), simulator.requires, card, read_stability(bundle_folder))
     page = folder / "report.html"
     config = OmegaConf.to_yaml(cfg, resolve=True)
     write_page(page, title, metrics, figures, evaluation.cases[0].result, scene, model, config, versions(cases[0]))

@@ -8,14 +8,16 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
+from gns_pyg.bundle import SHIPPED
 from gns_pyg.errors import DataError
 from gns_pyg.evaluation.metrics import write_json
 from gns_pyg.files import whole
 from gns_pyg.report.verdict import verdict_markdown
 
 
-def collect(runs: Path, docs: Path) -> dict[str, Any]:
-    """Reads runs/<bundle>/stability.json of every bundle, writes stability.json, stability.md and the pictures.
+def collect(runs: Path, docs: Path, shipped: Path = SHIPPED) -> dict[str, Any]:
+    """Reads runs/<bundle>/stability.json of every bundle, writes stability.json, stability.md and the pictures, and
+    puts each verdict into its bundle, whose pages show it.
 
     Raises:
         DataError: if there is none.
@@ -27,7 +29,10 @@ def collect(runs: Path, docs: Path) -> dict[str, Any]:
     for path in paths:
         picture = path.parent / "plots" / "stability.png"
         shutil.copyfile(picture, docs / "figures" / f"stability_{path.parent.name}.png")
-    write_json(docs / "stability.json", {name: _without_curves(entry) for name, entry in found.items()})
+    plain = {name: {key: value for key, value in entry.items() if key != "curves"} for name, entry in found.items()}
+    write_json(docs / "stability.json", plain)
+    for name, entry in plain.items():
+        write_json(shipped / name / "stability.json", entry)
     page = docs / "stability.md"
     text = with_tables(page.read_text(encoding="utf-8"), found)
     with whole(page) as temporary:
@@ -44,10 +49,6 @@ def with_tables(page: str, found: Mapping[str, Any]) -> str:
         _, _, after = rest.partition(end)
         page = f"{before}{begin}{table}\n{end}{after}"
     return page
-
-
-def _without_curves(entry: Mapping[str, Any]) -> dict[str, Any]:
-    return {key: value for key, value in entry.items() if key != "curves"}
 
 
 if __name__ == "__main__":

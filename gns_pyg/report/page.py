@@ -9,6 +9,7 @@ from typing import Any
 
 from gns_pyg.errors import BundleError
 from gns_pyg.evaluation.metrics import CaseResult
+from gns_pyg.evaluation.stress import Line
 from gns_pyg.files import whole
 from gns_pyg.report import sections
 from gns_pyg.report.player import ASSETS, player
@@ -24,13 +25,13 @@ class Model:
         name: the bundle, as `bundle=...` would name it.
         requires: what it was built of.
         card: what it was trained on and what that cost.
-        stability: rows of the stress suite, None where it was not run.
+        stability: what stress.py found, None where it was not run.
     """
 
     name: str
     requires: Requirements
     card: Mapping[str, Any]
-    stability: Sequence[Mapping[str, Any]] | None = None
+    stability: Sequence[Line] | None = None
 
 
 def write_page(
@@ -81,22 +82,22 @@ def write_page(
     return path
 
 
-def read_stability(bundle: Path, card: Mapping[str, Any]) -> Sequence[Mapping[str, Any]] | None:
-    """What the stress suite said of a bundle: stability.json in its folder or beside it, else its card's `stability`.
+def read_stability(bundle: Path) -> list[Line] | None:
+    """The verdict that stress.py gave a bundle: stability.json in its folder or beside it; None if there is none.
 
     Raises:
-        BundleError: if the file is not a list of {"line": str, "holds": true, false or null, "found": str}.
+        BundleError: if the file is not what stress.py writes.
     """
     file = next((f / "stability.json" for f in (bundle, bundle.parent) if (f / "stability.json").is_file()), None)
     if file is None:
-        return card.get("stability")
+        return None
     try:
-        rows = json.loads(file.read_text(encoding="utf-8"))
-        sound = all(isinstance(row["line"], str) and row["holds"] in sections.HOLDS for row in rows)
-        sound = sound and all(isinstance(row["found"], str) for row in rows)
+        lines = [Line(**row) for row in json.loads(file.read_text(encoding="utf-8"))["lines"]]
+        sound = all(isinstance(text, str) for line in lines for text in (line.line, line.found))
+        sound = sound and all(line.hard in (True, False) and line.holds in (True, False, None) for line in lines)
     except (OSError, ValueError, KeyError, TypeError):
         sound = False
     if not sound:
-        expected = 'a list of {"line": text, "holds": true, false or null, "found": text}'
+        expected = "what stress.py writes: `lines`, each with line, hard, holds and found"
         raise BundleError(file, "something else", expected, "run stress.py again, or delete the file")
-    return rows
+    return lines

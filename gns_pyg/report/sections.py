@@ -8,8 +8,10 @@ from pathlib import Path
 from typing import Any
 
 from gns_pyg.errors import DataError
+from gns_pyg.evaluation.stress import Line
 from gns_pyg.report.cost import break_even
 from gns_pyg.report.table import metric_rows
+from gns_pyg.report.verdict import mark
 from gns_pyg.scene.requirements import Requirements
 from gns_pyg.scene.scene import Motion, Scene
 
@@ -17,7 +19,6 @@ PAPER = {  # its own network on its own scenes: one step at t = 0.1 s; last fram
     "hopper": "0.874 mm after one step at 0.1 s, 93.9 mm at 2 s, on its hopper of 2,608 grains",
     "drum": "2.81 mm after one step at 0.1 s, 79.0 mm at 3 s, on its drum of 2,530 grains",
 }
-HOLDS = {True: "holds", False: "does not hold", None: "not known"}
 
 
 def scene_summary(scene: Scene) -> dict[str, str]:
@@ -97,11 +98,14 @@ def speed(metrics: Mapping[str, Any], cost: Mapping[str, Any] | None, scene: Sce
     return table(("", "", ""), rows)
 
 
-def stability(verdict: Sequence[Mapping[str, Any]] | None, bundle: str) -> str:
-    """What the stress suite found: rows of `line`, `holds` (true, false or null) and `found`."""
+def stability(verdict: Sequence[Line] | None, bundle: str) -> str:
+    """What the stress suite found, or how to run it."""
     if verdict is None:
-        return f"<p>not run: <code>python stress.py bundle={html.escape(bundle)}</code></p>"
-    return table(("", "", "found"), [(row["line"], HOLDS[row["holds"]], row["found"]) for row in verdict])
+        return (
+            f"<p>not run: <code>python stress.py bundle={html.escape(bundle)}</code>; its stability.json, put into the "
+            "bundle's folder, is shown here</p>"
+        )
+    return table(("", "", "found"), [(line.line, mark(line), line.found) for line in verdict])
 
 
 def trained_on(card: Mapping[str, Any]) -> str:

@@ -1,17 +1,18 @@
 """Figures, table and page of a small evaluation."""
 
 import dataclasses
-import json
 import re
 
 import numpy as np
 import pytest
 
+from gns_pyg.bundle import SHIPPED
 from gns_pyg.data.trajectory import Trajectory
 from gns_pyg.errors import BundleError, DataError
 from gns_pyg.evaluation.baselines import climatology
 from gns_pyg.evaluation.errors import positions
-from gns_pyg.evaluation.metrics import case_result, evaluate_cases
+from gns_pyg.evaluation.metrics import case_result, evaluate_cases, write_json
+from gns_pyg.evaluation.stress import Line
 from gns_pyg.report.page import Model, read_stability, write_page
 from gns_pyg.report.plots import draw, write_plots
 from gns_pyg.report.sections import scene_summary
@@ -175,37 +176,48 @@ def test_page_gives_the_papers_figures_and_says_where_they_do_not_compare(heap, 
     assert "hopper_small is another scene: the figures do not compare" in words(page(heap, [], tmp_path, scene=small))
 
 
-ROWS = [
-    {"line": "ten times the length", "holds": True, "found": "0 escaped"},
-    {"line": "twice the speed", "holds": False, "found": "3 escaped"},
-    {"line": "half the friction", "holds": None, "found": "no case"},
+LINES = [
+    Line("ten times the length", True, True, "0 escaped"),
+    Line("twice the speed", True, False, "3 escaped"),
+    Line("settled pile", True, None, "walls move"),
+    Line("fewer bits", False, None, "0.1 mm"),
 ]
 
 
 def test_page_states_the_stability_verdict_or_how_to_get_one(heap, tmp_path):
     assert "not run: python stress.py bundle=runs/1/bundle" in words(page(heap, [], tmp_path))
-    text = words(page(heap, [], tmp_path, stability=ROWS))
+    text = words(page(heap, [], tmp_path, stability=LINES))
     assert "ten times the length holds 0 escaped" in text
-    assert "twice the speed does not hold 3 escaped" in text
-    assert "half the friction not known no case" in text
+    assert "twice the speed FAILS 3 escaped" in text
+    assert "settled pile no mark walls move" in text
+    assert "fewer bits - 0.1 mm" in text
 
 
-def test_stability_is_read_from_the_bundle_beside_it_or_its_card(tmp_path):
+def test_stability_is_read_from_the_bundle_or_beside_it(tmp_path):
     bundle = tmp_path / "bundle"
     bundle.mkdir()
-    assert read_stability(bundle, {}) is None
-    assert read_stability(bundle, {"stability": ROWS[2:]}) == ROWS[2:]
-    (tmp_path / "stability.json").write_text(json.dumps(ROWS[1:]))
-    assert read_stability(bundle, {"stability": ROWS[2:]}) == ROWS[1:]
-    (bundle / "stability.json").write_text(json.dumps(ROWS))
-    assert read_stability(bundle, {}) == ROWS
+    assert read_stability(bundle) is None
+    for place, lines in ((tmp_path, LINES[1:]), (bundle, LINES)):
+        write_json(place / "stability.json", {"form": "full", "lines": [line.plain() for line in lines]})
+        assert read_stability(bundle) == lines
 
 
-@pytest.mark.parametrize("content", ["[", "{}x", "3", '[{"line": "a"}]', '[{"line": "a", "holds": 2, "found": "b"}]'])
+ODD = '{"lines": [{"line": "a", "hard": true, "holds": 2, "found": "b"}]}'
+
+
+@pytest.mark.parametrize(
+    "content",
+    ["[", "3", "[]", '{"lines": [3]}', '{"lines": [{"line": "a"}]}', f'{{"lines": [{{{LINE}, "holds": 2}}]}}'],
+)
 def test_a_stability_file_of_another_kind_is_refused(tmp_path, content):
     (tmp_path / "stability.json").write_text(content)
     with pytest.raises(BundleError, match=r"stability\.json"):
-        read_stability(tmp_path, {})
+        read_stability(tmp_path)
+
+
+def test_the_shipped_bundles_show_their_verdict():
+    for name in ("hopper", "drum"):
+        assert all(line.holds is not False for line in read_stability(SHIPPED / name))
 
 
 def test_page_names_a_missing_figure(heap, tmp_path):
