@@ -205,10 +205,7 @@ def test_stability_is_read_from_the_bundle_or_beside_it(tmp_path):
 ODD = '{"lines": [{"line": "a", "hard": true, "holds": 2, "found": "b"}]}'
 
 
-@pytest.mark.parametrize(
-    "content",
-    ["[", "3", "[]", '{"lines": [3]}', '{"lines": [{"line": "a"}]}', f'{{"lines": [{{{LINE}, "holds": 2}}]}}'],
-)
+@pytest.mark.parametrize("content", ["[", "3", "[]", '{"lines": [3]}', '{"lines": [{"line": "a"}]}', ODD])
 def test_a_stability_file_of_another_kind_is_refused(tmp_path, content):
     (tmp_path / "stability.json").write_text(content)
     with pytest.raises(BundleError, match=r"stability\.json"):
