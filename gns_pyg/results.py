@@ -14,6 +14,7 @@ import numpy as np
 from gns_pyg import bundle, machine
 from gns_pyg.card import FILE as CARD
 from gns_pyg.card import card_page
+from gns_pyg.data.coverage import seen
 from gns_pyg.data.datamodule import EMBEDDED, find_cases, open_embedded, open_to_compare
 from gns_pyg.data.trajectory import Trajectory
 from gns_pyg.errors import DataError
@@ -26,7 +27,6 @@ from gns_pyg.evaluation.observables import angle_of_repose, escaped_grains, from
 from gns_pyg.evaluation.predict import roll_out, start_frame
 from gns_pyg.report.plots import draw, ensemble_spread
 from gns_pyg.report.results_page import results_page
-from gns_pyg.run import seen
 from gns_pyg.scene.scene import Scene
 
 BUNDLES = {  # what ships -> conditions it was never trained on

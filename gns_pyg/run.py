@@ -3,13 +3,11 @@
 import itertools
 import logging
 import warnings
-from collections.abc import Mapping
 from dataclasses import asdict, replace
 from importlib.metadata import version
 from pathlib import Path
 from typing import Any
 
-import numpy as np
 import pytorch_lightning as pl
 import torch
 from hydra.errors import InstantiationException
@@ -21,7 +19,7 @@ from pytorch_lightning.utilities.rank_zero import rank_zero_only
 
 from gns_pyg import bundle, machine
 from gns_pyg.config import check_keys, flat, plain, require, typed
-from gns_pyg.data.coverage import coverage, outside_coverage, values
+from gns_pyg.data.coverage import coverage, outside_coverage, seen, values
 from gns_pyg.data.datamodule import DataConfig, DataModule, Split, find_cases, open_to_compare, split
 from gns_pyg.data.statistics import measure
 from gns_pyg.data.trajectory import Trajectory
@@ -54,7 +52,6 @@ from gns_pyg.training.module import TrainingModule
 
 GROUPS = ["scene", "model", "requires", "data", "training", "trainer", "callbacks", "logger"]
 TRAIN_KEYS = ["name", "start_s", "compare_every_s", "ckpt_path", "device", "folder", *GROUPS]
-SAME_START = 1e-3  # of a radius: starts nearer than this are of one run, recorded otherwise
 log = logging.getLogger(__name__)
 
 
@@ -245,16 +242,6 @@ def unseen_cases(scene: Scene, folder: str | None, card: dict[str, Any], every_s
     content nor, however they were recorded, their start is that of one that it was."""
     cases = [open_to_compare(path, scene, every_s) for path in find_cases(scene, folder)]
     return [case for case in cases if not seen(case, scene, card)]
-
-
-def seen(case: Trajectory, scene: Scene, card: Mapping[str, Any]) -> bool:
-    """Whether a bundle was trained or validated on a case."""
-    digests = {digest for purpose in ("train", "val") for digest in card["cases"][purpose].values()}
-    starts = [np.array(start) for start in card.get("starts", [])]  # bundles made before have none
-    within_m = SAME_START * scene.grains.radii_m[0]
-    own = case.start()
-    same = (own.shape == start.shape and np.abs(own - start).max() < within_m for start in starts)
-    return case.content_hash() in digests or any(same)
 
 
 def warn_outside(scene: Scene, case: Trajectory, start: int, card: dict[str, Any]) -> None:

@@ -1,6 +1,7 @@
 """What a set of cases covers, and what of a new one lies outside."""
 
 from collections.abc import Mapping, Sequence
+from typing import Any
 
 import numpy as np
 import torch
@@ -14,6 +15,7 @@ from gns_pyg.scene.scene import PARAMETERS, Scene
 SPEEDS = ("grain speed, m/s", "angular speed, rad/s")  # an upper limit counts, with some room
 WALLS = "wall speed, m/s"  # of each part's fastest corner; both limits count, with some room
 ROOM, SLACK = 1.2, 0.01
+SAME_START = 1e-3  # of a radius: starts nearer than this are of one run, recorded otherwise
 
 
 def values(trajectories: Sequence[Trajectory]) -> dict[str, list[float]]:
@@ -78,3 +80,14 @@ def _wall_speeds(scene: Scene) -> list[float]:
                 fastest = max(fastest, float(torch.linalg.vector_norm(vel, dim=1).max()))
         speeds.append(fastest)
     return speeds
+
+
+def seen(case: Trajectory, scene: Scene, card: Mapping[str, Any]) -> bool:
+    """Whether a bundle of this card was trained or validated on a case: on its content or, however it was recorded, on
+    a case of the same start."""
+    digests = {digest for purpose in ("train", "val") for digest in card["cases"][purpose].values()}
+    starts = [np.array(start) for start in card.get("starts", [])]  # bundles made before have none
+    within_m = SAME_START * scene.grains.radii_m[0]
+    own = case.start()
+    same = (own.shape == start.shape and np.abs(own - start).max() < within_m for start in starts)
+    return case.content_hash() in digests or any(same)

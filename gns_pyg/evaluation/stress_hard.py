@@ -167,7 +167,7 @@ def settled(bench: Bench) -> Verdict:
     scene = replace(Scene.from_config(case.scene), frame_dt_s=bench.simulator.scene.frame_dt_s)
     simulator = in_scene(bench.simulator, scene)
     state, frame = initial_state(simulator, case, case.n_frames - 1), case.n_frames // 2
-    n = SETTLED_STEPS if bench.full else 200
+    n = SETTLED_STEPS if bench.full else 400
     mass_center, speed, curve = state.pos.mean(0), [], [0.0]
     for after in steps(simulator, state, n):
         speed.append(float(after.vel.square().sum(1).mean()))

@@ -88,4 +88,4 @@ def test_the_check_of_the_checks():
 def test_bundles_that_ship_hold_data_only():
     files = [path for path in bundle.SHIPPED.rglob("*") if path.is_file()]
     assert len(files) >= 6
-    assert {path.name for path in files} == {"bundle.json", "card.md", "weights.safetensors"}
+    assert {path.name for path in files} == {"bundle.json", "card.md", "stability.json", "weights.safetensors"}
