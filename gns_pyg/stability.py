@@ -17,7 +17,7 @@ from gns_pyg.report.verdict import verdict_markdown
 
 def collect(runs: Path, docs: Path, shipped: Path = SHIPPED) -> dict[str, Any]:
     """Reads runs/<bundle>/stability.json of every bundle, writes stability.json, stability.md and the pictures, and
-    puts each verdict into its bundle, whose pages show it.
+    puts each verdict into the bundle of that name, whose pages show it.
 
     Raises:
         DataError: if there is none.
@@ -32,7 +32,8 @@ def collect(runs: Path, docs: Path, shipped: Path = SHIPPED) -> dict[str, Any]:
     plain = {name: {key: value for key, value in entry.items() if key != "curves"} for name, entry in found.items()}
     write_json(docs / "stability.json", plain)
     for name, entry in plain.items():
-        write_json(shipped / name / "stability.json", entry)
+        if (shipped / name).is_dir():
+            write_json(shipped / name / "stability.json", entry)
     page = docs / "stability.md"
     text = with_tables(page.read_text(encoding="utf-8"), found)
     with whole(page) as temporary:

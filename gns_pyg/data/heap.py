@@ -5,7 +5,7 @@ import mmap
 import struct
 from pathlib import Path
 
-HEAD = struct.Struct("<4sB3xQ")  # signature, version, size of the collection
+HEAD = struct.Struct("<4sB3sQ")  # signature, version, reserved, size of the collection
 OBJECT = struct.Struct("<HH4xQ")  # number (0: free space), references, size
 ALIGNED = 8  # objects begin at multiples of this
 
@@ -36,7 +36,9 @@ def endless_heap(path: Path) -> str | None:
 def _endless(content: mmap.mmap, start: int) -> bool:
     if start + HEAD.size > len(content):
         return False
-    _, _, size = HEAD.unpack_from(content, start)
+    _, version, reserved, size = HEAD.unpack_from(content, start)
+    if version != 1 or reserved != bytes(3):  # four bytes of data that look like a heap's name
+        return False
     at, end = start + HEAD.size, min(start + size, len(content))
     while at + OBJECT.size <= end:
         number, _, length = OBJECT.unpack_from(content, at)

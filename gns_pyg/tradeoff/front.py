@@ -79,8 +79,8 @@ def equivalent_yade(rows: Sequence[Row]) -> Row | None:
 
 def break_even(row: Row, rows: Sequence[Row], cost: Mapping[str, float]) -> float | None:
     """After how many roll-outs of `cost["simulated_s"]` a network has paid back what Yade took for its training cases
-    and what its training took; inf where it is no faster than Yade at its equivalent step, None where its training was
-    not timed or no Yade step is equivalent.
+    and what its training took; inf where it is no faster than Yade at its equivalent step, None where one of the
+    times is not known or no Yade step is equivalent.
 
     Args:
         row: of a network.
@@ -89,6 +89,8 @@ def break_even(row: Row, rows: Sequence[Row], cost: Mapping[str, float]) -> floa
     """
     yade = equivalent_yade(rows)
     if yade is None:
+        return None
+    if not (math.isfinite(seconds(yade)) and math.isfinite(seconds(row))):
         return None
     saved_s = (seconds(yade) - seconds(row)) * cost["simulated_s"]
     if saved_s <= 0:

@@ -29,9 +29,9 @@ def row_of(cfg: DictConfig, point: Point) -> dict[str, Any] | None:
     }
 
 
-def table(cfg: DictConfig, among: Sequence[Point] | None = None) -> list[dict[str, Any]]:
-    """The rows that are there, in the order of the points (of `cfg` if none are named)."""
-    found = [row for point in (among or points(cfg)) if (row := row_of(cfg, point)) is not None]
+def table(cfg: DictConfig) -> list[dict[str, Any]]:
+    """The rows that are there, in the order of the points."""
+    found = [row for point in points(cfg) if (row := row_of(cfg, point)) is not None]
     rows: list[dict[str, Any]] = []
     for row in found:
         kept = {key: value for key, value in row.items() if key not in LEFT_OUT}

@@ -1,7 +1,8 @@
 """A search with Optuna that spends its trials near the front: time against errors in centre of mass and angle.
 
 Its study is Optuna's own file in the results folder, so several processes may search together, a stopped one goes on,
-and every tool for studies reads it. Each trial is a point like any other, with a row like any other.
+and every tool for studies reads it. Each trial is a point like any other, with a row like any other in that folder; the
+table holds the sweeps' points alone.
 """
 
 import logging
@@ -51,7 +52,7 @@ def search(cfg: DictConfig) -> list[dict[str, Any]]:
     path.parent.mkdir(parents=True, exist_ok=True)
     study = optuna.create_study(
         storage=JournalStorage(JournalFileBackend(str(path))),
-        study_name=f"{cfg.experiment}, {cfg.budget_cpu_s} s",
+        study_name=f"{cfg.experiment}, {cfg.budget_cpu_s} s, {', '.join(map(str, cfg.search))}",
         sampler=optuna.samplers.TPESampler(seed=cfg.seed),
         directions=["minimize"] * (1 + len(OBSERVED)),
         load_if_exists=True,

@@ -43,7 +43,7 @@ def _about(rows: Sequence[Row]) -> list[str]:
     processors = {row["time"]["processor"] for row in rows if row.get("time")}
     said = "none: every step measured leaves the scatter, or none was measured"
     return [
-        f"{len(networks)} trained points, {networks[0]['budget_cpu_s'] if networks else 0:g} s of processor time each, "
+        f"{len(networks)} trained points, about {networks[0]['budget_cpu_s'] if networks else 0:g} s of processor time each, "
         f"on one thread of {' or '.join(sorted(processors)) or 'a machine that was not asked (no times)'}.",
         f"Yade's largest step that shows the same: {said if yade is None else yade['name']}.",
         f"Fastest network whose centre of mass and angle of repose are within what seeds differ by: {_headline(rows)}.",

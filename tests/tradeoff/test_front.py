@@ -77,6 +77,9 @@ def test_break_even_counts_cases_and_training_against_what_a_roll_out_saves():
     assert break_even(row("a", 3.0, training_cpu_s=150.0), rows, cost) == math.inf
     assert break_even(row("a", 1.0), rows, cost) is None
     assert break_even(row("a", 1.0, training_cpu_s=150.0), rows[:1], cost) is None
+    untimed = [seeds(), yade(1e-4, None, 0.01)]
+    assert break_even(row("a", 1.0, training_cpu_s=150.0), untimed, cost) is None
+    assert break_even(row("a", None, training_cpu_s=150.0), untimed, cost) is None
 
 
 ROWS_TO_CHOOSE = [
