@@ -42,8 +42,9 @@ def _about(rows: Sequence[Row]) -> list[str]:
     yade = equivalent_yade(rows)
     processors = {row["time"]["processor"] for row in rows if row.get("time")}
     said = "none: every step measured leaves the scatter, or none was measured"
+    budget_s = networks[0]["budget_cpu_s"] if networks else 0
     return [
-        f"{len(networks)} trained points, about {networks[0]['budget_cpu_s'] if networks else 0:g} s of processor time each, "
+        f"{len(networks)} trained points, about {budget_s:g} s of processor time each, "
         f"on one thread of {' or '.join(sorted(processors)) or 'a machine that was not asked (no times)'}.",
         f"Yade's largest step that shows the same: {said if yade is None else yade['name']}.",
         f"Fastest network whose centre of mass and angle of repose are within what seeds differ by: {_headline(rows)}.",
