@@ -15,12 +15,11 @@ from hydra import compose, initialize_config_dir
 
 from gns_pyg import machine
 from gns_pyg.config import CONF
-from gns_pyg.data.datamodule import DataConfig, split
 from gns_pyg.evaluation.metrics import write_json
 from gns_pyg.tradeoff.axes import axes_of
 from gns_pyg.tradeoff.front import choose, seconds
 from gns_pyg.tradeoff.job import beside, judged
-from gns_pyg.tradeoff.points import NETWORKS, Point, scene_of
+from gns_pyg.tradeoff.points import NETWORKS, Point, cases_of
 from gns_pyg.tradeoff.recommend import read_table
 from gns_pyg.tradeoff.timing import apart, once
 
@@ -43,7 +42,7 @@ def main(folder: str | None) -> None:
     with initialize_config_dir(f"{CONF}/tradeoff", version_base="1.3"):
         cfg = compose("tradeoff", [f"results={folder}"] if folder else [])
     rows = read_table(ROOT / "docs" / "tradeoff.json", "hopper")
-    case = split(scene_of(cfg), DataConfig(dir=cfg.data.dir)).test[0]
+    case = cases_of(cfg).test[0]
     found = {}
     for budget, (most_s, errors) in BUDGETS.items():
         row = choose(rows, 1.0, most_s, errors)

@@ -20,8 +20,7 @@ import torch
 from omegaconf import DictConfig
 
 from gns_pyg import bundle, run
-from gns_pyg.config import typed
-from gns_pyg.data.datamodule import DataConfig, open_to_compare, split
+from gns_pyg.data.datamodule import open_to_compare
 from gns_pyg.data.trajectory import Trajectory
 from gns_pyg.dynamics.simulator import Simulator
 from gns_pyg.errors import ConfigError, GnsError, StorageError
@@ -33,7 +32,7 @@ from gns_pyg.evaluation.twins import Twins
 from gns_pyg.files import held, remove
 from gns_pyg.scene.scene import Scene
 from gns_pyg.tradeoff import dem
-from gns_pyg.tradeoff.points import NETWORKS, Point, as_plain, config, digest, scene_of, train_config
+from gns_pyg.tradeoff.points import NETWORKS, Point, as_plain, cases_of, config, digest, scene_of, train_config
 
 TRIAL = 40  # updates that tell how many the budget allows
 TWINS = 2  # per case
@@ -178,9 +177,7 @@ def thinned(result: CaseResult, every_s: float) -> CaseResult:
 
 def beside(cfg: DictConfig, point: Point) -> dict[str, Any]:
     """The figures of a row that is no network: Yade at another step, or a yardstick, on the same cases."""
-    training = train_config(cfg, Point("trained", ()), f"data.dir={cfg.data.dir or 'null'}")
-    scene = scene_of(cfg)
-    cases = split(scene, typed(DataConfig, training.data, "data"))
+    scene, cases = scene_of(cfg), cases_of(cfg)
     expected, start_s = climatology(cases.train, scene), cfg.start_s
     more: dict[str, Any] = {}
     match point.kind:

@@ -14,8 +14,8 @@ from hydra.core.global_hydra import GlobalHydra
 from hydra.core.override_parser.overrides_parser import OverridesParser
 from omegaconf import DictConfig, OmegaConf
 
-from gns_pyg.config import CONF, plain, require
-from gns_pyg.data.datamodule import find_cases
+from gns_pyg.config import CONF, plain, require, typed
+from gns_pyg.data.datamodule import DataConfig, Split, find_cases, split
 from gns_pyg.data.trajectory import Trajectory
 from gns_pyg.errors import DataError
 from gns_pyg.scene.scene import Scene
@@ -118,6 +118,12 @@ def train_config(cfg: DictConfig, point: Point, *more: str) -> DictConfig:
 def scene_of(cfg: DictConfig) -> Scene:
     """The scene that all points are judged in, at the frame step of its cases."""
     return Scene.from_config(train_config(cfg, Point("trained", ())).scene)
+
+
+def cases_of(cfg: DictConfig) -> Split:
+    """The cases that all points are judged on, `test`, and those that the default point is trained on."""
+    training = train_config(cfg, Point("trained", ()), f"data.dir={cfg.data.dir or 'null'}")
+    return split(scene_of(cfg), typed(DataConfig, training.data, "data"))
 
 
 def digest(cfg: DictConfig, point: Point) -> str:

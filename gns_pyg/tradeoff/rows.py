@@ -7,12 +7,10 @@ from typing import Any
 
 from omegaconf import DictConfig
 
-from gns_pyg.config import typed
-from gns_pyg.data.datamodule import DataConfig, split
 from gns_pyg.tradeoff import front
 from gns_pyg.tradeoff.axes import axes_of
 from gns_pyg.tradeoff.job import folder_of
-from gns_pyg.tradeoff.points import NETWORKS, Point, points, scene_of, train_config
+from gns_pyg.tradeoff.points import NETWORKS, Point, cases_of, points
 
 LEFT_OUT = ("cases", "metrics")  # in the run's own row.json
 SHOWN = ("test/rollout_error_final_m", "test/mean_overlap_ratio", "test/granular_temperature_m2_s2")
@@ -51,8 +49,7 @@ def table(cfg: DictConfig) -> list[dict[str, Any]]:
 def costs(cfg: DictConfig, rows: Sequence[dict[str, Any]]) -> dict[str, float]:
     """What `front.break_even` needs: Yade's seconds for the training cases at its equivalent step, as timed here (as
     stored with them where it is not), and the length of a roll-out."""
-    training = train_config(cfg, Point("trained", ()), f"data.dir={cfg.data.dir or 'null'}")
-    cases = split(scene_of(cfg), typed(DataConfig, training.data, "data"))
+    cases = cases_of(cfg)
     yade = front.equivalent_yade(rows)
     rate = math.inf if yade is None else front.seconds(yade)
     stored = sum(float(case.run.get("cpu_time_s", case.run["wall_clock_s"])) for case in cases.train)

@@ -14,12 +14,11 @@ from typing import Any
 from omegaconf import DictConfig
 
 from gns_pyg.config import plain, require
-from gns_pyg.data.datamodule import DataConfig, split
 from gns_pyg.errors import DependencyError
 from gns_pyg.tradeoff.axes import axes_of
 from gns_pyg.tradeoff.front import OBSERVED, seconds
 from gns_pyg.tradeoff.job import do
-from gns_pyg.tradeoff.points import Point, points, scene_of, sweep_values
+from gns_pyg.tradeoff.points import Point, cases_of, points, sweep_values
 from gns_pyg.tradeoff.rows import row_of
 from gns_pyg.tradeoff.timing import apart, once
 
@@ -71,7 +70,7 @@ def search(cfg: DictConfig) -> list[dict[str, Any]]:
         row = do(cfg, point)
         if row is None or row["error"] is not None:
             raise optuna.TrialPruned
-        case = split(scene_of(cfg), DataConfig(dir=cfg.data.dir)).test[0]
+        case = cases_of(cfg).test[0]
         values = goals(row | {"time": apart(lambda: once(cfg, point, case))})
         if not _complete(values):
             raise optuna.TrialPruned

@@ -60,8 +60,8 @@ def _headline(rows: Sequence[Row]) -> str:
     beside = [row for row in (equivalent_yade(rows), paper) if row is not None]
     factors = [f"{seconds(row) / seconds(best):.3g} times as fast as {row['name']}" for row in beside]
     pays = best.get("break_even_rollouts")
-    told = "what its training cost is not known" if pays is None else f"it pays after {pays} roll-outs"
-    return ", ".join([best["name"], *factors, told if pays != "never" else "so it never pays"])
+    known = {None: "what its training cost is not known", "never": "so it never pays"}
+    return ", ".join([best["name"], *factors, known.get(pays, f"it pays after {pays} roll-outs")])
 
 
 def _cells(row: Row) -> list[str]:

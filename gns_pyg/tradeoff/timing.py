@@ -13,14 +13,14 @@ import torch
 from omegaconf import DictConfig
 
 from gns_pyg import machine
-from gns_pyg.config import require, typed
-from gns_pyg.data.datamodule import DataConfig, open_to_compare, split
+from gns_pyg.config import require
+from gns_pyg.data.datamodule import open_to_compare
 from gns_pyg.data.trajectory import Trajectory
 from gns_pyg.evaluation.metrics import write_json
 from gns_pyg.evaluation.predict import initial_state, roll_out, start_frame
 from gns_pyg.tradeoff import dem
 from gns_pyg.tradeoff.job import folder_of, simulator_of
-from gns_pyg.tradeoff.points import NETWORKS, Point, points, scene_of, train_config
+from gns_pyg.tradeoff.points import NETWORKS, Point, cases_of, points, scene_of
 from gns_pyg.tradeoff.rows import row_of
 
 log = logging.getLogger(__name__)
@@ -37,9 +37,7 @@ def times(cfg: DictConfig) -> dict[str, Any]:
     todo = [
         p for p in points(cfg) if p.kind in (*NETWORKS, "yade") and (row_of(cfg, p) or {"error": ""})["error"] is None
     ]
-    scene = scene_of(cfg)
-    training = train_config(cfg, Point("trained", ()), f"data.dir={cfg.data.dir or 'null'}")
-    case = split(scene, typed(DataConfig, training.data, "data")).test[0]
+    case = cases_of(cfg).test[0]
     measured: dict[Point, list[dict[str, float]]] = {point: [] for point in todo}
     for number in range(cfg.rounds):
         for point in todo:
