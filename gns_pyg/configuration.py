@@ -6,7 +6,6 @@ All of it is read from where the keys live: the records that check them (their d
 import inspect
 import json
 import re
-import sys
 import types
 from collections.abc import Iterator
 from dataclasses import MISSING, Field, fields, is_dataclass
@@ -187,5 +186,4 @@ def _text(cell: str) -> str:
 
 
 if __name__ == "__main__":
-    target = Path(sys.argv[1] if len(sys.argv) > 1 else "docs/configuration.md")
-    target.write_text(configuration_page(), encoding="utf-8")
+    Path("docs/configuration.md").write_text(configuration_page(), encoding="utf-8")

@@ -29,7 +29,7 @@ from gns_pyg.dynamics.model_config import ModelConfig
 from gns_pyg.dynamics.simulator import Simulator
 from gns_pyg.errors import CheckpointError, ConfigError, GnsError, NumericalError
 from gns_pyg.evaluation.baselines import Climatology, climatology
-from gns_pyg.evaluation.ensemble import roll_out_ensemble
+from gns_pyg.evaluation.ensemble import Ensemble, roll_out_ensemble
 from gns_pyg.evaluation.errors import positions
 from gns_pyg.evaluation.judge import judge, judge_rollout
 from gns_pyg.evaluation.metrics import Evaluation, dem_seconds, evaluate_cases, strict, write_json
@@ -40,7 +40,7 @@ from gns_pyg.evaluation.stress_measured import MEASURED
 from gns_pyg.report.loggers import close, log_report
 from gns_pyg.report.page import Model, read_stability, write_page
 from gns_pyg.report.plots import ensemble_spread, write_figure, write_plots
-from gns_pyg.report.table import ensemble_table, metrics_table
+from gns_pyg.report.table import ensemble_rows, metric_rows, text_table
 from gns_pyg.report.verdict import draw_verdict, mark, verdict_table
 from gns_pyg.scene.boundary_points import boundary_points
 from gns_pyg.scene.requirements import Requirements, Requires, resolve
@@ -157,7 +157,7 @@ def evaluate(cfg: DictConfig) -> dict[str, Any]:
 
 def rollout(cfg: DictConfig) -> dict[str, Any]:
     """Rolls a bundle out from a recorded case, writes the trajectory in the data's own format, and compares it with the
-    recorded case."""
+    recorded case; with `ensemble`, so do as many copies of its start."""
     simulator, card = load_bundle(cfg), bundle.card(cfg.bundle)
     if cfg.trajectory is None:
         unseen = unseen_cases(simulator.scene, None, card, None)
@@ -172,13 +172,13 @@ def rollout(cfg: DictConfig) -> dict[str, Any]:
             log.warning("%s: the bundle was trained or validated on this case", trajectory.path.name)
     path, start = Path(cfg.folder) / "rollout.h5", start_frame(trajectory, cfg.start_s)
     warn_outside(simulator.scene, trajectory, start, card)
-    if cfg.ensemble is not None:
-        return roll_out_members(simulator, trajectory, start, cfg)
+    ensemble = None if cfg.ensemble is None else roll_out_members(simulator, trajectory, start, cfg)
     seconds = write_rollout(simulator, trajectory, start, path)
     log.info("%.3g s per simulated second -> %s", seconds, path)
     result = judge_rollout(simulator, trajectory, start, positions(Trajectory(path)), seconds)
     evaluation = evaluate_cases([result], Climatology.from_plain(card["climatology"]), simulator.scene)
-    return {"rollout": str(path)} | report(simulator, [trajectory], evaluation, cfg, cfg.bundle, card)
+    done = report(simulator, [trajectory], evaluation, cfg, cfg.bundle, card, ensemble=ensemble)
+    return {"rollout": str(path)} | done
 
 
 def stress(cfg: DictConfig) -> dict[str, Any]:
@@ -225,16 +225,14 @@ def stress(cfg: DictConfig) -> dict[str, Any]:
     return found
 
 
-def roll_out_members(simulator: Simulator, case: Trajectory, start: int, cfg: DictConfig) -> dict[str, Any]:
-    """Rolls out `ensemble` copies of a start; writes ensemble.json and a picture, prints the scores."""
-    members, folder = cfg.ensemble, Path(cfg.folder)
+def roll_out_members(simulator: Simulator, case: Trajectory, start: int, cfg: DictConfig) -> Ensemble:
+    """Rolls out `ensemble` copies of a start; writes ensemble.json, prints the scores."""
+    members = cfg.ensemble
     require(isinstance(members, int) and members >= 2, "ensemble", members, "at least 2 members", "e.g. ensemble=16")
     ensemble = roll_out_ensemble(simulator, case, start, members)
-    write_json(folder / "ensemble.json", ensemble.plain())
-    title = f"{simulator.scene.name}, {case.path.stem}: {members} roll-outs that start a micrometre apart"
-    write_figure(ensemble_spread(ensemble, title), folder / "plots" / "ensemble")
-    log.info("\n%s", ensemble_table(ensemble, title, {"run folder": folder, "picture": folder / "plots/ensemble.png"}))
-    return {f"crps/{name}": score for name, score in ensemble.crps().items()}
+    write_json(Path(cfg.folder) / "ensemble.json", ensemble.plain())
+    log.info("\n%s", text_table(f"{simulator.scene.name}, {case.path.stem}", ensemble_rows(ensemble), {}))
+    return ensemble
 
 
 def unseen_cases(scene: Scene, folder: str | None, card: dict[str, Any], every_s: float | None) -> list[Trajectory]:
@@ -411,6 +409,7 @@ def report(
     bundle_name: str | Path,
     card: dict[str, Any],
     trainer: pl.Trainer | None = None,
+    ensemble: Ensemble | None = None,
 ) -> dict[str, Any]:
     """Writes what a simulator did on `cases`: metrics.json, cases.json, plots and page; prints the table. The loggers
     of the trainer that trained it get the same."""
@@ -420,9 +419,14 @@ def report(
         "speed/threads": torch.get_num_threads(),
         "speed/device": device_name(simulator.scale.device),
     }
+    if ensemble is not None:
+        metrics |= {f"crps/{name}": score for name, score in ensemble.crps().items()}
     write_json(folder / "metrics.json", metrics)
     write_json(folder / "cases.json", evaluation.per_case)
     figures = write_plots(evaluation, scene, folder / "plots")
+    if ensemble is not None:
+        apart = f"{scene.name}: {len(ensemble.error_m)} roll-outs that start a micrometre apart"
+        figures += write_figure(ensemble_spread(ensemble, apart), folder / "plots" / "ensemble")
     if trainer is not None:
         log_report(trainer.loggers, evaluation, scene, figures, folder, trainer.global_step)
     unseen = not any(seen(case, simulator.scene, card) for case in cases)
@@ -432,9 +436,10 @@ def report(
     model = Model(str(bundle_name), simulator.requires, card, read_stability(bundle_folder))
     page = folder / "report.html"
     config = OmegaConf.to_yaml(cfg, resolve=True)
-    write_page(page, title, metrics, figures, evaluation.cases[0].result, scene, model, config, versions(cases[0]))
+    shown, used = evaluation.cases[0].result, versions(cases[0])
+    write_page(page, title, metrics, figures, shown, scene, model, config, used, ensemble)
     places = {"run folder": folder, "bundle": bundle_folder, "plots": folder / "plots", "report": page}
-    log.info("\n%s", metrics_table(metrics, title, places))
+    log.info("\n%s", text_table(title, metric_rows(metrics), places))
     return metrics
 
 

@@ -8,11 +8,13 @@ from pathlib import Path
 from typing import Any
 
 from gns_pyg.errors import BundleError
+from gns_pyg.evaluation.ensemble import Ensemble
 from gns_pyg.evaluation.metrics import CaseResult
 from gns_pyg.evaluation.stress import Line
 from gns_pyg.files import whole
 from gns_pyg.report import sections
 from gns_pyg.report.player import ASSETS, player
+from gns_pyg.report.verdict import Verdict
 from gns_pyg.scene.requirements import Requirements
 from gns_pyg.scene.scene import Scene
 
@@ -31,7 +33,7 @@ class Model:
     name: str
     requires: Requirements
     card: Mapping[str, Any]
-    stability: Sequence[Line] | None = None
+    stability: Verdict | None = None
 
 
 def write_page(
@@ -44,6 +46,7 @@ def write_page(
     model: Model,
     config_yaml: str,
     versions: Mapping[str, str],
+    ensemble: Ensemble | None = None,
 ) -> Path:
     """Writes the report page under a temporary name, then renames it to `path`.
 
@@ -57,11 +60,13 @@ def write_page(
         model: what simulated it.
         config_yaml: the resolved config of the run.
         versions: program or package -> version.
+        ensemble: roll-outs from nearly the same start, where there are some.
     """
     path = Path(path)
     parts = [
         ("DEM and network", player(shown, scene)),
         ("How good it is", sections.errors(metrics, scene)),
+        *([] if ensemble is None else [("How certain it is", sections.ensemble(ensemble))]),
         ("Speed and break-even", sections.speed(metrics, model.card.get("cost"), scene)),
         ("Stability", sections.stability(model.stability, model.name)),
         ("Curves", sections.figures(figures)),
@@ -82,7 +87,7 @@ def write_page(
     return path
 
 
-def read_stability(bundle: Path) -> list[Line] | None:
+def read_stability(bundle: Path) -> Verdict | None:
     """The verdict that stress.py gave a bundle: stability.json in its folder or beside it; None if there is none.
 
     Raises:
@@ -92,12 +97,14 @@ def read_stability(bundle: Path) -> list[Line] | None:
     if file is None:
         return None
     try:
-        lines = [Line(**row) for row in json.loads(file.read_text(encoding="utf-8"))["lines"]]
-        sound = all(isinstance(text, str) for line in lines for text in (line.line, line.found))
+        found = json.loads(file.read_text(encoding="utf-8"))
+        form, lines = found["form"], [Line(**row) for row in found["lines"]]
+        texts = [form, *(text for line in lines for text in (line.line, line.found))]
+        sound = all(isinstance(text, str) for text in texts)
         sound = sound and all(line.hard in (True, False) and line.holds in (True, False, None) for line in lines)
     except (OSError, ValueError, KeyError, TypeError):
         sound = False
     if not sound:
-        expected = "what stress.py writes: `lines`, each with line, hard, holds and found"
+        expected = "what stress.py writes: `form` and `lines`, each with line, hard, holds and found"
         raise BundleError(file, "something else", expected, "run stress.py again, or delete the file")
-    return lines
+    return Verdict(form, lines)

@@ -8,10 +8,10 @@ from pathlib import Path
 from typing import Any
 
 from gns_pyg.errors import DataError
-from gns_pyg.evaluation.stress import Line
+from gns_pyg.evaluation.ensemble import SHIFT_M, Ensemble
 from gns_pyg.report.cost import break_even
-from gns_pyg.report.table import metric_rows
-from gns_pyg.report.verdict import mark
+from gns_pyg.report.table import ensemble_rows, metric_rows
+from gns_pyg.report.verdict import Verdict, mark
 from gns_pyg.scene.requirements import Requirements
 from gns_pyg.scene.scene import Motion, Scene
 
@@ -98,14 +98,26 @@ def speed(metrics: Mapping[str, Any], cost: Mapping[str, Any] | None, scene: Sce
     return table(("", "", ""), rows)
 
 
-def stability(verdict: Sequence[Line] | None, bundle: str) -> str:
+def ensemble(found: Ensemble) -> str:
+    """Mean and spread of the members beside DEM."""
+    heading, *rows = ensemble_rows(found)
+    remark = (
+        f"{len(found.error_m)} roll-outs from starts {1e6 * SHIFT_M:g} \N{MICRO SIGN}m apart (standard deviation of "
+        "every coordinate): mean and spread over them, in SI units. CRPS, the continuous ranked probability score: 0 "
+        "is perfect, and of a single roll-out it is the absolute error. Curves: figure <i>ensemble</i>."
+    )
+    return f"<p>{remark}</p>{table(heading, rows)}"
+
+
+def stability(verdict: Verdict | None, bundle: str) -> str:
     """What the stress suite found, or how to run it."""
     if verdict is None:
         return (
             f"<p>not run: <code>python stress.py bundle={html.escape(bundle)}</code>; its stability.json, put into the "
             "bundle's folder, is shown here</p>"
         )
-    return table(("", "", "found"), [(line.line, mark(line), line.found) for line in verdict])
+    rows = [(line.line, mark(line), line.found) for line in verdict.lines]
+    return f"<p>{html.escape(verdict.form)} form of stress.py</p>{table(('', '', 'found'), rows)}"
 
 
 def trained_on(card: Mapping[str, Any]) -> str:

@@ -1,7 +1,7 @@
 """The few lines that a run ends with: what the network does, beside what costs nothing and beside DEM."""
 
 import math
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from typing import Any
 
 from gns_pyg.evaluation.ensemble import Ensemble
@@ -20,19 +20,19 @@ OBSERVED = [  # what, key, factor, unit
 ]
 
 
-def metrics_table(metrics: Mapping[str, Any], title: str, places: Mapping[str, object]) -> str:
-    """Lays out the metrics of `evaluate_cases` as plain text in human units.
+def text_table(title: str, rows: Sequence[tuple[str, str, str]], places: Mapping[str, object]) -> str:
+    """Rows as plain text.
 
     Args:
-        metrics: the flat dict of metrics.
         title: first line, e.g. the scene and the number of test cases.
+        rows: of `metric_rows` or `ensemble_rows`.
         places: what -> where: run folder, plots, bundle.
     """
-    return "\n".join([title, _grid(metric_rows(metrics)), *(f"{what}: {where}" for what, where in places.items())])
+    return "\n".join([title, _grid(rows), *(f"{what}: {where}" for what, where in places.items())])
 
 
 def metric_rows(metrics: Mapping[str, Any]) -> list[tuple[str, str, str]]:
-    """Rows of (what, network, beside), the first one the heading; also what the page shows."""
+    """The metrics of `evaluate_cases` in human units, as rows of (what, network, beside); the first is the heading."""
 
     def millimetres(key: str) -> str:
         return _number(metrics.get(key), 1e3, " mm")
@@ -137,9 +137,10 @@ def metric_rows(metrics: Mapping[str, Any]) -> list[tuple[str, str, str]]:
     return rows
 
 
-def ensemble_table(ensemble: Ensemble, title: str, places: Mapping[str, object]) -> str:
-    """Every observable, mean over the roll-out: of DEM, of the members, their spread, and the CRPS."""
-    rows = [("mean over the roll-out", "network", "beside")]
+def ensemble_rows(ensemble: Ensemble) -> list[tuple[str, str, str]]:
+    """Every observable, mean over the roll-out: of the members, their spread, of DEM, and the CRPS; the first row is
+    the heading."""
+    rows = [("mean over the roll-out", f"{len(ensemble.error_m)} roll-outs", "beside")]
     scores = ensemble.crps()
     for name, members in ensemble.members.items():
         spread = nanmean(members.std(axis=0, ddof=1))
@@ -147,10 +148,10 @@ def ensemble_table(ensemble: Ensemble, title: str, places: Mapping[str, object])
         beside = f"{_number(dem, 1.0, '')} DEM; CRPS {_number(scores[name], 1.0, '')}"
         rows.append((name, f"{_number(own, 1.0, '')} \N{PLUS-MINUS SIGN} {_number(spread, 1.0, '')}", beside))
     rows.append(("escaped grains, most of any member", _count(ensemble.escaped), ""))
-    return "\n".join([title, _grid(rows), *(f"{what}: {where}" for what, where in places.items())])
+    return rows
 
 
-def _grid(rows: list[tuple[str, str, str]]) -> str:
+def _grid(rows: Sequence[tuple[str, str, str]]) -> str:
     widths = [max(len(row[column]) for row in rows) for column in range(3)]
     lines = [f"{row[0]:<{widths[0]}}  {row[1]:>{widths[1]}}  {row[2]}".rstrip() for row in rows]
     rule = "\N{BOX DRAWINGS LIGHT HORIZONTAL}" * max(len(line) for line in lines)

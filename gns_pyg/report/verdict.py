@@ -2,6 +2,7 @@
 
 import textwrap
 from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
@@ -10,6 +11,19 @@ from matplotlib.figure import Figure
 from gns_pyg.evaluation.stress import Line
 
 MARKS = {True: "holds", False: "FAILS", None: "-"}
+
+
+@dataclass(frozen=True)
+class Verdict:
+    """What stress.py found of a bundle.
+
+    Attributes:
+        form: full or short.
+        lines: hard ones first.
+    """
+
+    form: str
+    lines: Sequence[Line]
 
 
 def mark(line: Line) -> str:

@@ -37,7 +37,10 @@ def test_an_ensemble_says_mean_spread_and_score(tmp_path):
     speed = stored["observables"]["mean_speed_m_s"]
     assert np.allclose(speed["mean"], speed["dem"], rtol=0.5, atol=0.05)
     assert scores["crps/mean_speed_m_s"] == stored["crps"]["mean_speed_m_s"] >= 0
-    assert (tmp_path / "plots" / "ensemble.png").is_file()
+    page = (tmp_path / "report.html").read_text()
+    assert "3 roll-outs from starts 1 \N{MICRO SIGN}m apart" in page
+    assert '<figure class="ensemble">' in page
+    assert Trajectory(tmp_path / "rollout.h5").n_frames == 6
 
 
 def test_what_cannot_be_is_refused(tmp_path):

@@ -16,7 +16,8 @@ from gns_pyg.evaluation.stress import Line
 from gns_pyg.report.page import Model, read_stability, write_page
 from gns_pyg.report.plots import draw, write_plots
 from gns_pyg.report.sections import scene_summary
-from gns_pyg.report.table import metrics_table
+from gns_pyg.report.table import metric_rows, text_table
+from gns_pyg.report.verdict import Verdict
 from gns_pyg.scene.requirements import Requires, resolve
 from gns_pyg.scene.scene import Motion
 from tests import scenes
@@ -56,7 +57,7 @@ def test_a_turning_scene_without_angle_of_repose(tmp_path):
     figures = draw(evaluation, scene)
     assert "angle_of_repose" not in figures
     figures["snapshots"].savefig(tmp_path / "snapshots.png")
-    assert "angle of repose" not in metrics_table(evaluation.metrics, "turning", {})
+    assert "angle of repose" not in text_table("turning", metric_rows(evaluation.metrics), {})
 
 
 def test_a_scene_that_grains_pass_through_without_a_boundary(tmp_path):
@@ -68,7 +69,7 @@ def test_a_scene_that_grains_pass_through_without_a_boundary(tmp_path):
     evaluation = evaluate_cases([result], climatology([case], scene), scene)
     files = write_plots(evaluation, scene, tmp_path / "plots")
     assert {"outflow", "snapshots"} <= {file.stem for file in files}
-    text = metrics_table(evaluation.metrics, "passing", {})
+    text = text_table("passing", metric_rows(evaluation.metrics), {})
     assert re.search(r"grains that have left +100 % +\d+\.\d % DEM", text)
     assert re.search(r"outflow error, largest +\d+\.\d % +0\.00 % mean of training cases", text)
     assert scene_summary(scene)["grains"] == "5 of 20 mm, 5 of 10 mm diameter"
@@ -97,7 +98,7 @@ def test_open_moving_parts_are_drawn_and_described(tmp_path, motion, words):
 
 def test_table_states_human_units_beside_what_they_are_judged_by(heap):
     scene, evaluation = heap
-    text = metrics_table(evaluation.metrics, f"{scene.name}: 2 test cases", {"run": "runs/1", "bundle": "b"})
+    text = text_table(f"{scene.name}: 2 test cases", metric_rows(evaluation.metrics), {"run": "runs/1", "bundle": "b"})
     assert re.search(r"one-step error, whole run +0\.500 mm +0\.00 mm frozen \(best trivial", text)
     assert re.search(r"roll-out error, last frame +1\.73 mm +0\.00 mm frozen", text)
     assert re.search(r"angle of repose +2[45]\.\d° ± 0\.0° +25\.0° ± 0\.0° DEM", text)
@@ -108,7 +109,7 @@ def test_table_states_human_units_beside_what_they_are_judged_by(heap):
 
 def test_table_shows_a_dash_for_what_is_not_known(heap):
     metrics = dict.fromkeys(heap[1].metrics, None) | {"test/one_step_error_m": float("nan")}
-    text = metrics_table(metrics, "unknown", {})
+    text = text_table("unknown", metric_rows(metrics), {})
     assert re.search(r"one-step error, whole run +- ", text)
     assert "None" not in text
     assert "nan" not in text
@@ -186,7 +187,8 @@ LINES = [
 
 def test_page_states_the_stability_verdict_or_how_to_get_one(heap, tmp_path):
     assert "not run: python stress.py bundle=runs/1/bundle" in words(page(heap, [], tmp_path))
-    text = words(page(heap, [], tmp_path, stability=LINES))
+    text = words(page(heap, [], tmp_path, stability=Verdict("full", LINES)))
+    assert "full form of stress.py" in text
     assert "ten times the length holds 0 escaped" in text
     assert "twice the speed FAILS 3 escaped" in text
     assert "settled pile no mark walls move" in text
@@ -199,13 +201,15 @@ def test_stability_is_read_from_the_bundle_or_beside_it(tmp_path):
     assert read_stability(bundle) is None
     for place, lines in ((tmp_path, LINES[1:]), (bundle, LINES)):
         write_json(place / "stability.json", {"form": "full", "lines": [line.plain() for line in lines]})
-        assert read_stability(bundle) == lines
+        assert read_stability(bundle) == Verdict("full", lines)
 
 
-ODD = '{"lines": [{"line": "a", "hard": true, "holds": 2, "found": "b"}]}'
+ODD = '{"form": "full", "lines": [{"line": "a", "hard": true, "holds": 2, "found": "b"}]}'
 
 
-@pytest.mark.parametrize("content", ["[", "3", "[]", '{"lines": [3]}', '{"lines": [{"line": "a"}]}', ODD])
+@pytest.mark.parametrize(
+    "content", ["[", "3", "[]", '{"lines": [3]}', '{"lines": [{"line": "a"}]}', '{"lines": []}', ODD]
+)
 def test_a_stability_file_of_another_kind_is_refused(tmp_path, content):
     (tmp_path / "stability.json").write_text(content)
     with pytest.raises(BundleError, match=r"stability\.json"):
@@ -214,7 +218,7 @@ def test_a_stability_file_of_another_kind_is_refused(tmp_path, content):
 
 def test_the_shipped_bundles_show_their_verdict():
     for name in ("hopper", "drum"):
-        assert all(line.holds is not False for line in read_stability(SHIPPED / name))
+        assert all(line.holds is not False for line in read_stability(SHIPPED / name).lines)
 
 
 def test_page_names_a_missing_figure(heap, tmp_path):
