@@ -144,7 +144,7 @@ class Graph(Record):
     """Who can touch whom.
 
     Attributes:
-        grain_edges: [sender grain, receiver grain]; both directions of every pair.
+        grain_edges: [sender grain, receiver grain]; both directions of every pair, one where a network of pairs asks.
         wall_edges: [boundary point (row of `walls`), receiver grain]; walls only send.
         walls: the boundary points, or None where the scene has no boundary.
     """

@@ -34,6 +34,7 @@ PAPER = {
     "self_loops": True,
     "skip": False,
 }
+IMPULSE = {"network": "impulse"}
 STATISTICS = dict(
     velocity_m_s=0.5,
     spin_rad_s=20.0,

@@ -7,12 +7,18 @@ from omegaconf import MISSING
 
 from gns_pyg.config import require
 
+NETWORKS = ("message", "impulse")
+
 
 @dataclass
 class ModelConfig:
     """Architecture of a simulator.
 
     Attributes:
+        network: `message` sums messages into each grain's latent and reads what happens to it from there
+            (`models.contact_network`, the paper's); `impulse` has every contact exchange impulses, equal and opposite
+            (`models.impulse_network`).
+        channels: vectors that a grain carries between the rounds of an impulse network.
         absolute_position: give networks the absolute position (the paper; breaks translation invariance).
         contact_features: gap, approach and slip on edges, beside the geometry of Mayr et al.
         self_loops: an edge from every grain to itself, so that one without neighbours is computed too (the paper).
@@ -24,6 +30,8 @@ class ModelConfig:
         projection_sweeps: rounds in which every step moves grains out of each other and of walls (see `projection`).
     """
 
+    network: str = "message"
+    channels: int = 6
     absolute_position: bool = MISSING
     contact_features: bool = MISSING
     self_loops: bool = MISSING
@@ -40,6 +48,12 @@ class ModelConfig:
         for key in ("cutoff_grain_radii", "cutoff_wall_radii"):
             value = getattr(self, key)
             require(0 < value < math.inf, f"model.{key}", value, "above 0 and finite", "2.5 is the paper's")
-        for key, least in (("hidden", 1), ("layers", 1), ("mlp_layers", 2), ("projection_sweeps", 0)):
+        require(self.network in NETWORKS, "model.network", self.network, " or ".join(NETWORKS), "pick one of them")
+        if self.network == "impulse":
+            needs = {"absolute_position": False, "contact_features": True, "self_loops": False, "skip": True}
+            for key, needed in needs.items():
+                value, expected = getattr(self, key), f"{needed} with model.network=impulse"
+                require(value == needed, f"model.{key}", value, expected.lower(), "see conf/model/impulse.yaml")
+        for key, least in (("channels", 3), ("hidden", 1), ("layers", 1), ("mlp_layers", 2), ("projection_sweeps", 0)):
             value = getattr(self, key)
             require(value >= least, f"model.{key}", value, f"at least {least}", f"set model.{key} to {least} or more")

@@ -20,9 +20,11 @@ from gns_pyg.dynamics.passage import Passage
 from gns_pyg.dynamics.projection import separated
 from gns_pyg.dynamics.rest import rested
 from gns_pyg.dynamics.tiles import tiles
-from gns_pyg.graph import features
+from gns_pyg.graph import contacts, features
 from gns_pyg.graph.neighbors import backend, pairs
 from gns_pyg.models.contact_network import ContactNetwork
+from gns_pyg.models.impulse_network import GAINED, MEAN, VELOCITY, Grains, ImpulseNetwork, exchange
+from gns_pyg.models.mlp import mlp
 from gns_pyg.models.statistics import Statistics
 from gns_pyg.scene.boundary_points import BoundaryPoints
 from gns_pyg.scene.requirements import Requirements
@@ -62,6 +64,21 @@ class Simulator(nn.Module):
         self.edges_done = 0  # edges that went through the networks so far
         self._conditions = [PARAMETERS.index(name) for name in requires.material_features]
 
+        self.boundary: Boundary | None = None
+        if requires.wall_network:
+            static, reachable = requires.static_walls, requires.reachable_points
+            self.boundary = Boundary(scene, points, config, static=static, reachable=reachable)
+        self.grain_network: ContactNetwork | ImpulseNetwork
+        self.wall_network: ContactNetwork | ImpulseNetwork | None = None
+        if config.network == "impulse":
+            self._build_impulse_networks()
+        else:
+            self._build_message_networks()
+        self.passage = Passage(scene) if requires.active_mask else None
+        self.guard = Guard(scene)
+
+    def _build_message_networks(self) -> None:
+        config, requires = self.config, self.requires
         width: dict[str, Any] = dict(
             n_out=3 * self.integrator.n_groups,
             hidden=config.hidden,
@@ -73,18 +90,23 @@ class Simulator(nn.Module):
         n_grain = 3 + 3 * (requires.state == "full") + requires.radius_features + len(self._conditions) + n_position
         n_edge = features.n_grain_edge_features(config.contact_features)
         self.grain_network = ContactNetwork(n_sender=None, n_receiver=n_grain, n_edge=n_edge, **width)
-        self.boundary: Boundary | None = None
-        self.wall_network: ContactNetwork | None = None
         if requires.wall_network:
-            static, reachable = requires.static_walls, requires.reachable_points
-            self.boundary = Boundary(scene, points, config, static=static, reachable=reachable)
             n_point = 3 + 3 * requires.wall_velocity + requires.wall_friction + n_position
             n_edge = features.n_wall_edge_features(config.contact_features)
             self.wall_network = ContactNetwork(
-                n_sender=n_point, n_receiver=n_grain, n_edge=n_edge, sparse=reachable, **width
+                n_sender=n_point, n_receiver=n_grain, n_edge=n_edge, sparse=requires.reachable_points, **width
             )
-        self.passage = Passage(scene) if requires.active_mask else None
-        self.guard = Guard(scene)
+
+    def _build_impulse_networks(self) -> None:
+        config, requires = self.config, self.requires
+        width = {key: getattr(config, key) for key in ("hidden", "layers", "mlp_layers", "channels")}
+        n_grain = 2 + requires.radius_features + len(self._conditions)
+        self.encode_grain = mlp(n_grain, config.hidden, config.hidden, config.mlp_layers, layer_norm=True)
+        n_scalar, n_basis = contacts.N_SCALARS, contacts.N_BASIS
+        self.grain_network = ImpulseNetwork(n_scalar=n_scalar, n_basis=n_basis, mutual=True, **width)
+        if requires.wall_network:
+            n_scalar, n_basis = contacts.N_WALL_SCALARS + requires.wall_friction, contacts.N_WALL_BASIS
+            self.wall_network = ImpulseNetwork(n_scalar=n_scalar, n_basis=n_basis, mutual=False, **width)
 
     def forward(self, state: State) -> State:
         """Moves every grain by one frame."""
@@ -148,6 +170,12 @@ class Simulator(nn.Module):
     def effects(self, state: State, graph: Graph) -> Float[Tensor, "n_grains d"]:
         """What the contacts of `graph` add, over `scale`; 0 for a grain without an edge."""
         self.edges_done += graph.grain_edges.shape[1] + graph.wall_edges.shape[1]
+        where, cast = self.scale.device.type, self.execution.autocast
+        with torch.autocast(where, cast) if cast else nullcontext():
+            return self._impulses(state, graph) if self.config.network == "impulse" else self._messages(state, graph)
+
+    def _messages(self, state: State, graph: Graph) -> Float[Tensor, "n_grains d"]:
+        """The paper's equation (10): the sum of two networks."""
         grains = self._grain_features(state)
         options: dict[str, Any] = dict(
             velocity_m_s=self.statistics.velocity_m_s,
@@ -156,14 +184,43 @@ class Simulator(nn.Module):
             dtype=self.scale.dtype,
         )
         edges = features.grain_edges(state, graph, **options)
-        where, cast = self.scale.device.type, self.execution.autocast
-        with torch.autocast(where, cast) if cast else nullcontext():
-            total = self.grain_network(None, grains, edges, graph.grain_edges).to(self.scale.dtype)
-            if self.wall_network is not None and graph.walls is not None:
-                edges = features.wall_edges(state, graph, graph.walls, **options)
-                points = self._wall_features(graph.walls)
-                total = total + self.wall_network(points, grains, edges, graph.wall_edges).to(self.scale.dtype)
+        total = self.grain_network(None, grains, edges, graph.grain_edges).to(self.scale.dtype)
+        if self.wall_network is not None and graph.walls is not None:
+            edges = features.wall_edges(state, graph, graph.walls, **options)
+            points = self._wall_features(graph.walls)
+            total = total + self.wall_network(points, grains, edges, graph.wall_edges).to(self.scale.dtype)
         return total
+
+    def _impulses(self, state: State, graph: Graph) -> Float[Tensor, "n_grains d"]:
+        """Two networks that take turns on the same grains, from what these would do without contact."""
+        velocity_m_s, dtype = self.statistics.velocity_m_s, self.scale.dtype
+        free_vel = self.integrator.without_contact(state).vel
+        options: dict[str, Any] = dict(velocity_m_s=velocity_m_s, dt_s=self.scene.frame_dt_s, dtype=dtype)
+        grains = self._grains(state, free_vel)
+        unlike = len(self.scene.grains.radii_m) > 1
+        assert isinstance(self.grain_network, ImpulseNetwork)
+        kinds = [(self.grain_network, contacts.grain_contacts(state, free_vel, graph, unlike=unlike, **options))]
+        if isinstance(self.wall_network, ImpulseNetwork) and graph.walls is not None:
+            options |= dict(friction=self.requires.wall_friction, channels=self.config.channels)
+            kinds.append((self.wall_network, contacts.wall_contacts(state, free_vel, graph, graph.walls, **options)))
+        after = exchange(grains, kinds)
+        vel, spin = after.vel - grains.vel, after.spin - grains.spin
+        groups = [vel[:, :, MEAN], vel[:, :, VELOCITY]]
+        if state.ang_vel is not None:
+            groups.append((spin[:, :, VELOCITY] + spin[:, :, MEAN]) / state.radius[:, None].to(dtype))
+        return torch.cat(groups[: self.integrator.n_groups], dim=1) * velocity_m_s / self.scale
+
+    def _grains(self, state: State, free_vel: Float[Tensor, "n_grains 3"]) -> Grains:
+        """What grains carry into the first round: their speeds, and what they would do without contact."""
+        dtype, velocity_m_s = self.scale.dtype, self.statistics.velocity_m_s
+        ang_vel = torch.zeros_like(state.vel) if state.ang_vel is None else state.ang_vel
+        speeds = ((state.vel, velocity_m_s), (ang_vel, self.statistics.spin_rad_s))
+        columns = [torch.linalg.vector_norm(x, dim=1, keepdim=True) / scale for x, scale in speeds]
+        latent = self.encode_grain(torch.cat(columns + self._kinds(state), dim=1).to(dtype))
+        carried = state.vel.new_zeros(2, len(state.vel), 3, self.config.channels)
+        carried[0, :, :, VELOCITY], carried[0, :, :, GAINED] = free_vel, free_vel - state.vel
+        carried[1, :, :, VELOCITY] = state.radius[:, None] * ang_vel
+        return Grains(latent, *(carried / velocity_m_s).to(dtype))
 
     @property
     def settles(self) -> bool:
@@ -205,12 +262,23 @@ class Simulator(nn.Module):
         if self.requires.free_grains:
             free_pos = self.integrator.without_contact(state).pos
             graph = among(graph, can_touch(state, free_pos, graph, self.scene.frame_dt_s))
+        if self.config.network == "impulse":  # of a pair one direction
+            edges = graph.grain_edges
+            graph = replace(graph, grain_edges=edges[:, edges[0] < edges[1]])
         return graph
 
     def _grain_features(self, state: State) -> Float[Tensor, "n_grains f"]:
         columns = [state.vel / self.statistics.velocity_m_s]
         if state.ang_vel is not None:
             columns.append(state.ang_vel / self.statistics.spin_rad_s)
+        columns += self._kinds(state)
+        if self.config.absolute_position:
+            columns.append(self._absolute(state.pos))
+        return torch.cat(columns, dim=1).to(self.scale.dtype)
+
+    def _kinds(self, state: State) -> list[Float[Tensor, "n_grains _"]]:
+        """What makes grains unlike each other: radius and material, where the scene requires it."""
+        columns = []
         if self.requires.radius_features:
             columns.append(state.radius[:, None] / self.statistics.radius_m)
         if self._conditions and state.parameters is not None:
@@ -218,9 +286,7 @@ class Simulator(nn.Module):
                 constant(v, state.pos) for v in (self.statistics.parameters_mean, self.statistics.parameters_std)
             )
             columns.append(((state.parameters - mean) / std)[:, self._conditions][state.batch])
-        if self.config.absolute_position:
-            columns.append(self._absolute(state.pos))
-        return torch.cat(columns, dim=1).to(self.scale.dtype)
+        return columns
 
     def _wall_features(self, walls: Walls) -> Float[Tensor, "n_points f"]:
         columns = [walls.normal]

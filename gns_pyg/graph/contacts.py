@@ -1,0 +1,112 @@
+"""Contacts for networks that exchange impulses (see `models.impulse_network`): what stays when everything is turned,
+and directions that turn with it. Lengths over the grain radius (the mean of two), velocities over the data's scale.
+
+As in `features`, all is computed in the state's float64 and cast last.
+"""
+
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+from gns_pyg.graph.features import dot
+from gns_pyg.models.impulse_network import Contacts
+from gns_pyg.state import Graph, State, Walls
+
+N_SCALARS, N_WALL_SCALARS = 9, 11
+N_BASIS, N_WALL_BASIS = 2, 3
+FINE = 1e-3  # of a radius: an overlap that bears a few grains
+SLOW = 0.02  # of the data's velocity: slower slip has no sharp direction
+
+
+def grain_contacts(
+    state: State,
+    free_vel: Float[Tensor, "n 3"],
+    graph: Graph,
+    *,
+    unlike: bool,
+    velocity_m_s: float,
+    dt_s: float,
+    dtype: torch.dtype,
+) -> Contacts:
+    """Pairs of grains. Directions: the line of centres, the slip.
+
+    Args:
+        state: grains now.
+        free_vel: their velocity a frame later if nothing touched, m/s.
+        graph: pairs in one direction.
+        unlike: masses differ.
+        velocity_m_s, dt_s: the data's velocity scale and the frame.
+        dtype: the networks'.
+    """
+    sender, receiver = graph.grain_edges
+    rel_pos, rel_vel = (x.index_select(0, sender) - x.index_select(0, receiver) for x in (state.pos, free_vel))
+    touch = state.radius[sender] + state.radius[receiver]
+    radius, distance = touch / 2, torch.linalg.vector_norm(rel_pos, dim=1)
+    normal = rel_pos / torch.maximum(distance, 1e-3 * touch)[:, None]
+    slip = rel_vel
+    if state.ang_vel is not None:
+        arm = state.radius[:, None] * state.ang_vel
+        slip = rel_vel - torch.linalg.cross(arm.index_select(0, sender) + arm.index_select(0, receiver), normal)
+    ahead = torch.linalg.vector_norm(rel_pos + rel_vel * dt_s, dim=1)
+    scalars, sideways = _scalars(distance, distance - touch, ahead - touch, slip, normal, radius, velocity_m_s)
+    share = None
+    if unlike:
+        mass = torch.stack([state.radius[receiver], state.radius[sender]], dim=1) ** 3
+        share = (2 * mass / mass.sum(1, keepdim=True)).to(dtype)
+    basis = torch.stack([normal, sideways], dim=2)
+    return Contacts(graph.grain_edges, scalars.to(dtype), basis.to(dtype), share=share)
+
+
+def wall_contacts(
+    state: State,
+    free_vel: Float[Tensor, "n 3"],
+    graph: Graph,
+    walls: Walls,
+    *,
+    friction: bool,
+    channels: int,
+    velocity_m_s: float,
+    dt_s: float,
+    dtype: torch.dtype,
+) -> Contacts:
+    """Boundary points and grains; the gap is that to the point's tangent plane. Directions: against the wall's normal,
+    the slip, towards the point.
+
+    Args:
+        friction: the point's friction angle is a scalar too.
+        channels: vectors that a grain carries.
+        The others: as of `grain_contacts`.
+    """
+    point, grain = graph.wall_edges
+    normal, wall_vel = -walls.normal.index_select(0, point), walls.vel.index_select(0, point)
+    rel_pos = walls.pos.index_select(0, point) - state.pos.index_select(0, grain)
+    radius, rel_vel = state.radius[grain], wall_vel - free_vel.index_select(0, grain)
+    distance, height = torch.linalg.vector_norm(rel_pos, dim=1), dot(rel_pos, normal)
+    slip = rel_vel
+    if state.ang_vel is not None:
+        slip = rel_vel - torch.linalg.cross((state.radius[:, None] * state.ang_vel).index_select(0, grain), normal)
+    ahead = height + dot(rel_vel, normal) * dt_s
+    scalars, sideways = _scalars(distance, height - radius, ahead - radius, slip, normal, radius, velocity_m_s)
+    aside = torch.linalg.vector_norm(rel_pos - height[:, None] * normal, dim=1, keepdim=True) / radius[:, None]
+    columns = [scalars, aside, aside.square()]
+    if friction:
+        columns.append(walls.friction_angle[point][:, None])
+    towards = rel_pos / torch.maximum(distance, 1e-3 * radius)[:, None]
+    moving = torch.cat([(wall_vel / velocity_m_s)[:, :, None], rel_pos.new_zeros(len(point), 3, channels - 1)], dim=2)
+    basis = torch.stack([normal, sideways, towards], dim=2)
+    return Contacts(graph.wall_edges, torch.cat(columns, dim=1).to(dtype), basis.to(dtype), moving.to(dtype))
+
+
+def _scalars(
+    distance: Tensor, gap: Tensor, ahead: Tensor, slip: Tensor, normal: Tensor, radius: Tensor, velocity_m_s: float
+) -> tuple[Tensor, Tensor]:
+    """Nine scalars, and the direction of the slip, which fades where there is none."""
+    approach = dot(slip, normal)
+    tangential = slip - approach[:, None] * normal
+    speed = torch.linalg.vector_norm(tangential, dim=1)
+    near = radius / torch.maximum(distance, 0.1 * radius)
+    gap, ahead = gap / radius, ahead / radius
+    fine = [torch.asinh(x / FINE) / 4 for x in (gap, ahead)]
+    columns = [distance / radius, near, near**2, gap, ahead, *fine, approach / velocity_m_s, speed / velocity_m_s]
+    sideways = tangential / (speed.square() + (SLOW * velocity_m_s) ** 2).sqrt()[:, None]
+    return torch.stack(columns, dim=1), sideways

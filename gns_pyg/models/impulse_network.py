@@ -1,0 +1,196 @@
+"""Contacts as exchanged impulses: what touching bodies give each other is equal and opposite, and turns with them.
+
+Every round, each contact looks at how its two sides move against each other so far, gives both an impulse along its own
+directions, and the next round sees what all impulses together have changed: an iterative contact solver (Jean 1999)
+whose law is learned. Three things hold by construction, not by training: the pair's momentum does not change (Newton's
+third law), a tangential impulse turns both grains as an impulse at the point of contact does, and what is turned or
+mirrored comes out turned or mirrored (vectors enter only as products with each other, as in Schuett et al. 2021).
+"""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import torch
+from jaxtyping import Float, Int
+from torch import Tensor, nn
+from torch_geometric.nn import MessagePassing
+
+from gns_pyg.models.mlp import blocks, linear, mlp
+
+VELOCITY, MEAN, GAINED = 0, 1, 2  # channels: end velocity, mean velocity's correction, what gravity adds in a frame
+SPHERE = 2.5  # m r^2 / I: what a tangential impulse turns it
+SOFT = 1e-6  # under the root of a squared length, so that its gradient stays finite
+
+
+@dataclass(frozen=True)
+class Grains:
+    """What grains carry from round to round.
+
+    Attributes:
+        latent: (n_grains, hidden).
+        vel: velocities, dimensionless, one vector a channel, (n_grains, 3, channels).
+        spin: radius x angular velocity, likewise.
+    """
+
+    latent: Float[Tensor, "n hidden"]
+    vel: Float[Tensor, "n 3 channels"]
+    spin: Float[Tensor, "n 3 channels"]
+
+
+@dataclass(frozen=True)
+class Contacts:
+    """Contacts of one kind; of a pair of grains one of the two directions.
+
+    Attributes:
+        ends: [sender, receiver]; of a boundary point only the receiver is a row of `Grains`.
+        scalars: what stays when everything is turned, (n_contacts, n_scalars).
+        basis: the contact's directions, columns; first the unit normal, from the receiver to the other side.
+        wall_vel: dimensionless velocity of the boundary point, one vector a channel; None between grains.
+        share: how much more than its partner sender and receiver are moved by the same impulse: 2 m' / (m + m') with m'
+            the partner's mass; None where all masses are equal.
+    """
+
+    ends: Int[Tensor, "2 e"]
+    scalars: Float[Tensor, "e f"]
+    basis: Float[Tensor, "e 3 b"]
+    wall_vel: Float[Tensor, "e 3 channels"] | None = None
+    share: Float[Tensor, "e 2"] | None = None
+
+    def pieces(self, hidden: int) -> list["Contacts"]:
+        """As pieces that are best handled one after the other (see `mlp.blocks`)."""
+        rows = blocks(torch.arange(self.ends.shape[1], device=self.ends.device), hidden)
+        if len(rows) == 1:
+            return [self]
+        optional = (None if x is None else x.split(len(rows[0])) for x in (self.wall_vel, self.share))
+        lots = [[None] * len(rows) if lot is None else lot for lot in optional]
+        sides = (self.ends.split(len(rows[0]), 1), self.scalars.split(len(rows[0])), self.basis.split(len(rows[0])))
+        return [Contacts(*piece) for piece in zip(*sides, *lots, strict=True)]
+
+
+class ImpulseNetwork(nn.Module):
+    """All rounds of one kind of contact; networks of several kinds take turns on the same grains (see `exchange`).
+
+    Args:
+        n_scalar: scalars of a contact.
+        n_basis: its directions.
+        mutual: both sides are grains; else one is a wall, which nothing moves.
+        hidden, layers, mlp_layers: width, rounds, linear layers of each MLP.
+        channels: vectors that a grain carries, at least three.
+    """
+
+    def __init__(
+        self, *, n_scalar: int, n_basis: int, mutual: bool, hidden: int, layers: int, mlp_layers: int, channels: int
+    ) -> None:
+        super().__init__()
+        self.hidden = hidden
+        self.encode = mlp(n_scalar, hidden, hidden, mlp_layers, layer_norm=True)
+        self.rounds = nn.ModuleList(
+            ImpulseRound(hidden, mlp_layers, channels, n_basis, mutual=mutual, last=turn == layers - 1)
+            for turn in range(layers)
+        )
+
+    def forward(
+        self, turn: int, grains: Grains, contacts: Sequence[Contacts], edges: Sequence[Tensor] | None
+    ) -> tuple[Grains, list[Tensor]]:
+        """One round: what grains carry after it, and the contacts' latents.
+
+        Args:
+            turn: number of the round.
+            grains: before it.
+            contacts: in pieces.
+            edges: their latents after the round before, None in the first.
+        """
+        if edges is None:
+            edges = [self.encode(piece.scalars) for piece in contacts]
+        return self.rounds[turn](grains, contacts, edges)
+
+
+class ImpulseRound(MessagePassing):
+    """One round: every contact exchanges messages and impulses, then the grains' latents follow.
+
+    Args:
+        hidden, mlp_layers, channels, n_basis, mutual: see `ImpulseNetwork`.
+        last: no later round would read the grains' latents.
+    """
+
+    def __init__(self, hidden: int, mlp_layers: int, channels: int, n_basis: int, *, mutual: bool, last: bool) -> None:
+        super().__init__(aggr="sum", flow="source_to_target")
+        self.hidden, self.channels, self.mutual = hidden, channels, mutual
+        n_seen = channels * (n_basis + 1)
+        self.from_seen = nn.Linear(n_seen, hidden)
+        self.from_ends = nn.Linear(hidden, hidden, bias=False)  # a pair looks the same from either side
+        self.from_edge = nn.Linear(hidden, hidden, bias=False)
+        for part in (self.from_seen, self.from_ends, self.from_edge):
+            nn.init.uniform_(part.weight, -((3 * hidden) ** -0.5), (3 * hidden) ** -0.5)  # as one layer of 3 x hidden
+        self.message_mlp = mlp(hidden, hidden, hidden, mlp_layers - 1, layer_norm=True)
+        self.impulse_mlp = mlp(hidden, hidden, n_seen, 2)
+        with torch.no_grad():  # begin near free flight
+            for parameter in self.impulse_mlp[-1].parameters():
+                parameter.mul_(0.1)
+        self.update_mlp = None if last else mlp(2 * hidden, hidden, hidden, mlp_layers, layer_norm=True)
+
+    def forward(
+        self, grains: Grains, contacts: Sequence[Contacts], edges: Sequence[Tensor]
+    ) -> tuple[Grains, list[Tensor]]:
+        n, carried = len(grains.latent), torch.cat([grains.vel, grains.spin], dim=2)
+        latent, after = linear(self.from_ends, grains.latent), []
+        heard = 0 if self.update_mlp is None else self.hidden
+        gained = carried.new_zeros(n, heard + carried[0].numel())
+        for piece, before in zip(contacts, edges, strict=True):
+            edge, message, impulse, turn = self.edge_update(piece, before, latent, carried)
+            to, rows = piece.ends, torch.cat([message[:, :heard], impulse.flatten(1), turn.flatten(1)], dim=1)
+            if piece.share is not None:
+                rows[:, heard:] *= piece.share[:, 1:]
+            if self.mutual:
+                back = torch.cat([message[:, :heard], -impulse.flatten(1), turn.flatten(1)], dim=1)
+                if piece.share is not None:
+                    back[:, heard:] *= piece.share[:, :1]
+                to, rows = torch.cat([to, to.flip(0)], dim=1), torch.cat([rows, back])
+            if len(contacts) == 1:
+                gained = self.propagate(to, rows=rows.to(gained.dtype), size=(n, n))
+            else:
+                gained.index_add_(0, to[1], rows.to(gained.dtype))  # sums stay in full precision
+            after.append(edge)
+        vel, spin = (part.view(grains.vel.shape) for part in gained[:, heard:].chunk(2, dim=1))
+        there = grains.latent
+        if self.update_mlp is not None:
+            there = there + self.update_mlp(torch.cat([there, gained[:, :heard]], dim=1))
+        return Grains(there, grains.vel + vel, grains.spin + spin), after
+
+    def edge_update(
+        self, contacts: Contacts, edge: Tensor, latent: Tensor, carried: Tensor
+    ) -> tuple[Tensor, Tensor, Tensor, Tensor]:
+        """What every contact knows after this round, says to its grains, and gives the receiver: an impulse and a turn,
+        (n_contacts, 3, channels) each."""
+        (sender, receiver), basis = contacts.ends, contacts.basis
+        normal, n_basis = basis[:, :, :1], basis.shape[2]
+        vel, spin = carried.index_select(0, receiver).chunk(2, dim=2)
+        hidden = latent.index_select(0, receiver)
+        if self.mutual:
+            other_vel, other_spin = carried.index_select(0, sender).chunk(2, dim=2)
+            spin, hidden = spin + other_spin, hidden + latent.index_select(0, sender)
+        else:
+            assert contacts.wall_vel is not None
+            other_vel = contacts.wall_vel
+        slip = other_vel - vel - torch.linalg.cross(spin, normal.expand_as(spin), dim=1)  # of the surfaces in touch
+        along = (basis[:, :, :, None] * slip[:, :, None, :]).sum(1)
+        seen = torch.cat([along.flatten(1), (slip.square().sum(1) + SOFT).sqrt()], dim=1)
+        message = self.message_mlp((hidden + linear(self.from_edge, edge) + linear(self.from_seen, seen)).relu_())
+        edge = edge + message
+        factors = self.impulse_mlp(edge).view(len(edge), n_basis + 1, self.channels)
+        impulse = (basis[:, :, :, None] * factors[:, None, :-1]).sum(2) + factors[:, -1:] * slip
+        turn = SPHERE * torch.linalg.cross(normal.expand_as(impulse), impulse, dim=1)
+        return edge, message, impulse, turn
+
+    def message(self, rows: Tensor) -> Tensor:
+        return rows
+
+
+def exchange(grains: Grains, kinds: Sequence[tuple[ImpulseNetwork, Contacts]]) -> Grains:
+    """What grains carry after all rounds, in which the kinds of contact take turns."""
+    pieces = [contacts.pieces(network.hidden) for network, contacts in kinds]
+    edges: list[list[Tensor] | None] = [None] * len(kinds)
+    for turn in range(len(kinds[0][0].rounds)):
+        for kind, (network, _) in enumerate(kinds):
+            grains, edges[kind] = network(turn, grains, pieces[kind], edges[kind])
+    return grains

@@ -1,0 +1,148 @@
+"""Exchanged impulses: opposite and equal, turning with what they act on, gone where nothing is near."""
+
+from dataclasses import replace
+
+import pytest
+import torch
+from scipy.spatial.transform import Rotation
+
+from gns_pyg.dynamics import simulator as steps
+from gns_pyg.errors import ConfigError
+from gns_pyg.models import impulse_network
+from gns_pyg.models.impulse_network import Grains
+from gns_pyg.state import Walls
+from tests import scenes
+from tests.simulators import IMPULSE, simulator, state_in_box
+
+WALLS = {"shape": {"kind": "box", "size_m": [0.15, 0.15, 0.15], "center_m": [0.0, 0.0, 0.0]}, "points": 300}
+STATES = ("full", "velocity", "differences")
+
+
+def model(walls=False, radii=None, **changes):
+    boundary = {"walls": WALLS | {"friction_angle_rad": 0.5}} if walls else {}
+    scene = scenes.scene(40, 5, boundary=boundary)
+    if radii:
+        scene = replace(scene, grains=replace(scene.grains, radius_m=list(radii)))
+    return simulator(scene, dtype=torch.float64, **(IMPULSE | changes))
+
+
+@pytest.mark.parametrize("state", STATES)
+def test_no_momentum_is_made_between_grains(state):
+    network, start = model(state=state), state_in_box([25, 15], spin=state == "full")
+    given = network.correction(start)[:, : 6 if state != "differences" else 3]
+    assert given.abs().sum() > 1e-3
+    for graph in range(2):
+        assert torch.allclose(given[start.batch == graph].sum(0), torch.zeros(given.shape[1]).double(), atol=1e-12)
+
+
+def test_unlike_masses_exchange_momentum_and_spin_by_their_inertia():
+    """The sum of m v is kept, and an impulse F turns both grains by r n x F over their own 2/5 m r^2."""
+    network, start = model(radii=(0.01, 0.014)), state_in_box([40])
+    start = replace(start, radius=torch.tensor([0.01, 0.014]).double().repeat_interleave(20))
+    vel = network.correction(start)[:, 3:6]
+    mass = start.radius[:, None] ** 3
+    assert torch.allclose((mass * vel).sum(0), torch.zeros(3).double(), atol=1e-12 * float(mass.sum()))
+    assert (vel.sum(0).abs() > 1e-4).any()
+
+
+@pytest.mark.parametrize("walls", [False, True])
+@pytest.mark.parametrize("mirrored", [False, True])
+def test_what_is_turned_or_mirrored_comes_out_turned_or_mirrored(walls, mirrored):
+    network, start = model(walls), state_in_box([40])
+    q = torch.from_numpy(Rotation.from_euler("xyz", [0.3, 1.1, -2.0]).as_matrix())
+    q, hand = (-q, -1.0) if mirrored else (q, 1.0)
+    graph = network.graph(start)
+    turned = replace(start, pos=start.pos @ q.T, vel=start.vel @ q.T, ang_vel=hand * start.ang_vel @ q.T)
+    other = graph
+    if graph.walls is not None:
+        w = graph.walls
+        other = replace(graph, walls=Walls(w.pos @ q.T, w.normal @ q.T, w.vel @ q.T, w.friction_angle))
+    network.integrator = NoGravity(network.integrator)
+    expected = network.effects(start, graph).view(-1, 3, 3) @ q.T
+    expected[:, 2] *= hand
+    assert torch.allclose(network.effects(turned, other).view(-1, 3, 3), expected, atol=1e-10)
+
+
+class NoGravity:
+    """An integrator in whose free flight nothing falls: gravity's direction is not turned by the test."""
+
+    def __init__(self, integrator):
+        self.integrator, self.n_groups = integrator, integrator.n_groups
+
+    def without_contact(self, state):
+        return state
+
+
+def test_a_tangential_impulse_turns_both_grains_alike():
+    """A single contact: whatever it gives, both spins change by the same, along the normal by nothing."""
+    network, start = model(), state_in_box([40])
+    two = start.pick(torch.tensor([0, 1]))
+    two = replace(two, pos=torch.tensor([[0.0, 0.0, 0.0], [0.0192, 0.0, 0.0]]).double())
+    given = network.correction(two)
+    assert torch.allclose(given[0, :6], -given[1, :6])
+    assert torch.allclose(given[0, 6:], given[1, 6:])
+    assert given[0, 6:].abs().max() > 1e-4
+    assert given[0, 6].abs() < 1e-12, "no twist about the normal"
+
+
+def test_grains_that_touch_nothing_get_exactly_zero():
+    network, start = model(walls=True, free_grains=False), state_in_box([40])
+    far = replace(start, pos=torch.cat([start.pos[:-1] * 0.3, torch.tensor([[0.0, 0.0, 0.9]]).double()]))
+    assert torch.equal(network.correction(far)[-1], torch.zeros(9).double())
+
+
+def test_pieces_give_what_the_whole_gives(monkeypatch):
+    network, start = model(walls=True), state_in_box([40])
+    whole = network.correction(start)
+    monkeypatch.setattr("gns_pyg.models.mlp.BLOCK", 16 * 7)
+    with torch.no_grad():
+        assert torch.allclose(network.correction(start), whole, atol=1e-12)
+
+
+def test_every_pair_is_there_once():
+    network, start = model(), state_in_box([25, 15])
+    sender, receiver = network.graph(start).grain_edges
+    assert (sender < receiver).all()
+    both = simulator(network.scene, dtype=torch.float64).graph(start).grain_edges
+    assert both.shape[1] == 2 * len(sender)
+
+
+def test_gradients_are_finite_where_grains_coincide_and_stand_still():
+    network, start = model(walls=True), state_in_box([4])
+    pos = torch.zeros(4, 3).double().requires_grad_()
+    still = torch.zeros_like(start.vel)
+    network.correction(replace(start, pos=pos, vel=still, ang_vel=still)).sum().backward()
+    assert torch.isfinite(pos.grad).all()
+    assert all(torch.isfinite(p.grad).all() for p in network.parameters() if p.grad is not None)
+
+
+def test_every_parameter_is_used():
+    """Several processes that train together wait for the gradients of all."""
+    network = model(walls=True)
+    network.correction(state_in_box([40])).square().sum().backward()
+    assert all(p.grad is not None for p in network.parameters())
+
+
+@pytest.mark.parametrize(
+    "changes", [{"absolute_position": True}, {"self_loops": True}, {"channels": 2}, {"skip": False}]
+)
+def test_what_an_impulse_network_cannot_be_is_refused(changes):
+    with pytest.raises(ConfigError, match=f"model.{next(iter(changes))}"):
+        model(**changes)
+
+
+def test_an_unknown_network_is_refused():
+    with pytest.raises(ConfigError, match="message or impulse"):
+        model(network="other")
+
+
+def test_rounds_see_what_earlier_rounds_have_changed():
+    """Three grains in a row: the last is moved by the first only where there are two rounds."""
+    row = torch.tensor([[0.0, 0.0, 0.0], [0.0195, 0.0, 0.0], [0.039, 0.0, 0.0]]).double()
+    for layers, reached in ((1, False), (2, True)):
+        network, start = model(layers=layers, free_grains=False), replace(state_in_box([3]), pos=row)
+        faster = replace(start, vel=start.vel + torch.tensor([[1.0, 0.0, 0.0], [0.0] * 3, [0.0] * 3]).double())
+        moved = (network.correction(faster) - network.correction(start))[2].abs().max() > 1e-12
+        assert bool(moved) == reached
+    assert isinstance(steps.exchange, type(impulse_network.exchange))
+    assert Grains.__dataclass_fields__.keys() == {"latent", "vel", "spin"}
