@@ -135,7 +135,7 @@ class ImpulseRound(MessagePassing):
         n, carried = len(grains.latent), torch.cat([grains.vel, grains.spin], dim=2)
         latent, after = linear(self.from_ends, grains.latent), []
         heard = 0 if self.update_mlp is None else self.hidden
-        gained = carried.new_zeros(n, heard + carried[0].numel())
+        gained = carried.new_zeros(n, heard + 6 * self.channels)
         for piece, before in zip(contacts, edges, strict=True):
             edge, message, impulse, turn = self.edge_update(piece, before, latent, carried)
             to, rows = piece.ends, torch.cat([message[:, :heard], impulse.flatten(1), turn.flatten(1)], dim=1)
@@ -153,8 +153,13 @@ class ImpulseRound(MessagePassing):
             after.append(edge)
         vel, spin = (part.view(grains.vel.shape) for part in gained[:, heard:].chunk(2, dim=1))
         there = grains.latent
-        if self.update_mlp is not None:
-            there = there + self.update_mlp(torch.cat([there, gained[:, :heard]], dim=1))
+        if self.update_mlp is not None:  # of those that hear: a network that reaches nobody changes nothing
+            hears = torch.zeros(n, dtype=torch.bool, device=there.device)
+            for piece in contacts:
+                for end in piece.ends if self.mutual else piece.ends[1:]:
+                    hears.index_fill_(0, end, True)
+            updated = there + self.update_mlp(torch.cat([there, gained[:, :heard]], dim=1))
+            there = torch.where(hears[:, None], updated, there)
         return Grains(there, grains.vel + vel, grains.spin + spin), after
 
     def edge_update(

@@ -40,17 +40,26 @@ def test_the_step_is_the_simulator_s(scene, n_per_graph) -> None:
 
 
 @pytest.mark.parametrize(
-    "changes", [simulators.PAPER, {"self_loops": True}, {"free_grains": False}, {"state": "velocity"}, {"layers": 1}]
+    "changes",
+    [
+        simulators.PAPER,
+        simulators.IMPULSE,
+        {"self_loops": True},
+        {"free_grains": False},
+        {"state": "velocity"},
+        {"layers": 1},
+    ],
 )
 def test_the_step_is_the_simulator_s_whatever_the_model(changes) -> None:
     same_step(*model_and_state("drum and box", [80], **changes))
 
 
-def test_two_radii() -> None:
+@pytest.mark.parametrize("changes", [{}, simulators.IMPULSE])
+def test_two_radii(changes) -> None:
     grains = scenes.scene(80, 5).grains
     parts = {"boundary": {"walls": STILL}, "grains": {"count": 80, "radius_m": [0.01, 0.015], "share": [0.5, 0.5]}}
     parts["grains"]["material"] = vars(grains.material)
-    model = simulators.simulator(scenes.scene(80, 5, **parts), dtype=torch.float64)
+    model = simulators.simulator(scenes.scene(80, 5, **parts), dtype=torch.float64, **changes)
     state = simulators.state_in_box([80], half_m=0.1)
     state = replace(state, radius=torch.where(torch.arange(80) < 40, 0.01, 0.015).double())
     same_step(model, state)

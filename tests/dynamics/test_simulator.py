@@ -12,7 +12,7 @@ from gns_pyg.dynamics.rollout import rollout
 from gns_pyg.errors import ConfigError, NumericalError
 from gns_pyg.graph import neighbors
 from tests import scenes
-from tests.simulators import MODEL, PAPER, simulator, state_in_box
+from tests.simulators import IMPULSE, MODEL, PAPER, simulator, state_in_box
 
 SMALL_BOX = {"kind": "box", "size_m": [0.15, 0.15, 0.15], "center_m": [0.0, 0.0, 0.0]}
 
@@ -25,8 +25,8 @@ def boxed(n_grains, **motion):
 TURNING = {"kind": "rotation", "axis": [1.0, 0.0, 0.0], "rate_rad_s": 3.0}
 every_model = pytest.mark.parametrize(
     "changes",
-    [{}, {"state": "velocity"}, {"state": "differences", "skip": False}, PAPER],
-    ids=["full", "velocity", "differences", "paper"],
+    [{}, {"state": "velocity"}, {"state": "differences", "skip": False}, PAPER, IMPULSE],
+    ids=["full", "velocity", "differences", "paper", "impulse"],
 )
 
 

@@ -44,7 +44,10 @@ def test_a_ball_is_the_nearest_grains_of_each_graph_and_its_margin() -> None:
     assert torch.equal(region, region.sort().values)
 
 
-@pytest.mark.parametrize("changes", [{}, {"free_grains": False}, {"layers": 1}, {"self_loops": True}, simulators.PAPER])
+@pytest.mark.parametrize(
+    "changes",
+    [{}, {"free_grains": False}, {"layers": 1}, {"self_loops": True}, simulators.PAPER, simulators.IMPULSE],
+)
 @pytest.mark.parametrize("most", [7, 40])
 def test_tiles_give_the_same_step(changes, most) -> None:
     scene = scenes.scene(300, 5, boundary=WALLS)

@@ -21,7 +21,7 @@ from gns_pyg.scene.requirements import Requires, resolve
 from gns_pyg.scene.scene import Motion, Scene
 from gns_pyg.state import State
 from tests.scenes import scene
-from tests.simulators import MODEL, PAPER
+from tests.simulators import IMPULSE, MODEL, PAPER
 
 SIZES = {"one": (1.0,), "two": (0.4, 1.0), "far apart": (0.01, 1.0)}
 MODELS: dict[str, dict[str, Any]] = {
@@ -29,6 +29,8 @@ MODELS: dict[str, dict[str, Any]] = {
     "velocity": {"state": "velocity", "contact_features": False},
     "differences": {"state": "differences", "skip": False},
     "paper": PAPER,
+    "impulse": IMPULSE,
+    "impulse, differences": IMPULSE | {"state": "differences"},
 }
 MATERIAL = vars(scene(1, 5).grains.material)
 PLACES = ("loose", "crowded", "coincident", "near", "far", "on a point", "on an edge", "behind a wall")
