@@ -117,7 +117,7 @@ def train(scene: str, *overrides: str) -> dict[str, Any]:
     clock = f"+callbacks.clock._target_={__spec__.name if __spec__ else '__main__'}.Clock"
     with tempfile.TemporaryDirectory() as folder, initialize_config_dir(CONF, version_base="1.3"):
         quiet = ["callbacks.progress=null", "callbacks.rollout_metrics=null", f"folder={folder}", clock]
-        return run.train(compose("train", [f"scene={scene}", *quiet, *overrides]))
+        return run.train(compose("train", [f"scene={scene}", "model=contact", *quiet, *overrides]))
 
 
 def results() -> list[dict[str, Any]]:

@@ -108,7 +108,7 @@ def timed(function: Callable, spent: dict[str, float], phase: str) -> Callable:
 def paper_wide(name: str, *frames: int) -> tuple[Any, ...]:
     """An untrained simulator of width 128 and recorded states of a scene."""
     with initialize_config_dir(CONF, version_base="1.3"):
-        config = compose("train", [f"scene={name}", "model.hidden=128"])
+        config = compose("train", [f"scene={name}", "model=contact", "model.hidden=128"])
     scene = Scene.from_config(config.scene)
     case = open_case(find_cases(scene, None)[0], scene)
     requires = resolve(scene, {}, Requires())

@@ -60,7 +60,7 @@ def main() -> None:
 def of_scene(name: str) -> list[dict[str, Any]]:
     """The rows that the scene does without, and what each saves."""
     with initialize_config_dir(CONF, version_base="1.3"):
-        config = compose("train", [f"scene={name}"])
+        config = compose("train", [f"scene={name}", "model=contact"])
     scene, model = Scene.from_config(config.scene), typed(ModelConfig, config.model, "model")
     cases = [open_case(path, scene) for path in find_cases(scene, None)[:3]]
     seen = values(cases)

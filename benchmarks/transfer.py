@@ -41,7 +41,9 @@ def main() -> None:
     rows = []
     for scene, changes in CHANGES.items():
         folder = Path("runs/transfer") / scene
-        run.train(config("train", f"scene={scene}", "callbacks.rollout_metrics=null", f"folder={folder}"))
+        run.train(
+            config("train", f"scene={scene}", "model=contact", "callbacks.rollout_metrics=null", f"folder={folder}")
+        )
         own = run.evaluate(config("evaluate", f"bundle={folder}/bundle", f"folder={folder}/own"))
         rows.append({"scene": scene, "change": "none", "metrics": own})
         for change, (cases, overrides) in changes.items():

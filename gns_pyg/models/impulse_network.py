@@ -19,6 +19,9 @@ from gns_pyg.models.mlp import blocks, linear, mlp
 
 VELOCITY, MEAN, GAINED = 0, 1, 2  # channels: end velocity, mean velocity's correction, what gravity adds in a frame
 SPHERE = 2.5  # m r^2 / I: what a tangential impulse turns it
+FASTEST = (
+    30.0  # of the velocity scale: what answers a slip in proportion stays below, so that nothing grows without end
+)
 SOFT = 1e-6  # under the root of a squared length, so that its gradient stays finite
 
 
@@ -179,11 +182,13 @@ class ImpulseRound(MessagePassing):
             other_vel = contacts.wall_vel
         slip = other_vel - vel - torch.linalg.cross(spin, normal.expand_as(spin), dim=1)  # of the surfaces in touch
         along = (basis[:, :, :, None] * slip[:, :, None, :]).sum(1)
-        seen = torch.cat([along.flatten(1), (slip.square().sum(1) + SOFT).sqrt()], dim=1)
+        speed = (slip.square().sum(1) + SOFT).sqrt()
+        seen = torch.cat([along.flatten(1), speed], dim=1)
         message = self.message_mlp((hidden + linear(self.from_edge, edge) + linear(self.from_seen, seen)).relu_())
         edge = edge + message
         factors = self.impulse_mlp(edge).view(len(edge), n_basis + 1, self.channels)
-        impulse = (basis[:, :, :, None] * factors[:, None, :-1]).sum(2) + factors[:, -1:] * slip
+        against = factors[:, -1] / (1 + (speed / FASTEST).square()).sqrt()
+        impulse = (basis[:, :, :, None] * factors[:, None, :-1]).sum(2) + against[:, None] * slip
         turn = SPHERE * torch.linalg.cross(normal.expand_as(impulse), impulse, dim=1)
         return edge, message, impulse, turn
 
