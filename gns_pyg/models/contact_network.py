@@ -5,9 +5,9 @@ from jaxtyping import Bool, Float, Int
 from torch import Tensor, nn
 
 from gns_pyg.models.interaction import Interaction
-from gns_pyg.models.mlp import blocks, mlp
+from gns_pyg.models.mlp import blocks, mlp, recurring
 
-NODES, EDGES = 128, 512  # oneDNN builds a kernel for every new number of rows, which takes longer than its use
+NODES, EDGES = 128, 512  # rows come in multiples of them
 
 
 class ContactNetwork(nn.Module):
@@ -69,7 +69,7 @@ class ContactNetwork(nn.Module):
             grains, receiver = _compact(reached, receiver)
             receiver_features = receiver_features[grains]
         n_reached = len(receiver_features)
-        receivers = self.encode_receiver(_recurring(receiver_features, NODES))
+        receivers = self.encode_receiver(recurring(receiver_features, NODES))
         if self.encode_sender is None or sender_features is None:
             senders = None
             sender = _compact(reached, sender)[1] if sparse else sender
@@ -78,9 +78,9 @@ class ContactNetwork(nn.Module):
                 sending = torch.zeros(len(sender_features), dtype=torch.bool).index_fill(0, sender, True)
                 points, sender = _compact(sending, sender)
                 sender_features = sender_features[points]
-            senders = self.encode_sender(_recurring(sender_features, NODES))
-        sender, receiver = _recurring(sender, EDGES), _recurring(receiver, EDGES, value=len(receivers) - 1)
-        edges = [self.encode_edge(block) for block in blocks(_recurring(edge_features, EDGES), self.hidden)]
+            senders = self.encode_sender(recurring(sender_features, NODES))
+        sender, receiver = recurring(sender, EDGES), recurring(receiver, EDGES, value=len(receivers) - 1)
+        edges = [self.encode_edge(block) for block in blocks(recurring(edge_features, EDGES), self.hidden)]
         ends = blocks(torch.stack([sender, receiver]), self.hidden, dim=1)
         for interaction in self.interactions:
             receivers, edges = interaction(receivers if senders is None else senders, receivers, edges, ends)
@@ -88,13 +88,6 @@ class ContactNetwork(nn.Module):
         if sparse:
             return effect.new_zeros(n_receivers, self.n_out).index_copy(0, grains, effect)
         return torch.where(reached[:, None], effect, 0.0)
-
-
-def _recurring(rows: Tensor, multiple: int, value: int = 0) -> Tensor:
-    """`rows` and at least one more of `value`, so that their number comes again in other steps; where it matters."""
-    if len(rows) == 0 or rows.device.type != "cpu" or torch.is_grad_enabled():
-        return rows
-    return torch.cat([rows, rows.new_full((multiple - len(rows) % multiple, *rows.shape[1:]), value)])
 
 
 def _compact(chosen: Bool[Tensor, " n"], index: Int[Tensor, " e"]) -> tuple[Int[Tensor, " m"], Int[Tensor, " e"]]:

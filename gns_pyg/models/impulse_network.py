@@ -15,8 +15,9 @@ from jaxtyping import Float, Int
 from torch import Tensor, nn
 from torch_geometric.nn import MessagePassing
 
-from gns_pyg.models.mlp import blocks, linear, mlp
+from gns_pyg.models.mlp import blocks, linear, mlp, recurring
 
+ROWS = 128  # of which contacts come in multiples, as in `contact_network`
 VELOCITY, MEAN, GAINED = 0, 1, 2  # channels: end velocity, mean velocity's correction, what gravity adds in a frame
 SPHERE = 2.5  # m r^2 / I: what a tangential impulse turns it
 FASTEST = (
@@ -51,6 +52,7 @@ class Contacts:
         wall_vel: dimensionless velocity of the boundary point, one vector a channel; None between grains.
         share: how much more than its partner sender and receiver are moved by the same impulse: 2 m' / (m + m') with m'
             the partner's mass; None where all masses are equal.
+        n: how many of the rows are contacts, the first ones; None is all.
     """
 
     ends: Int[Tensor, "2 e"]
@@ -58,16 +60,18 @@ class Contacts:
     basis: Float[Tensor, "e 3 b"]
     wall_vel: Float[Tensor, "e 3 channels"] | None = None
     share: Float[Tensor, "e 2"] | None = None
+    n: int | None = None
 
     def pieces(self, hidden: int) -> list["Contacts"]:
-        """As pieces that are best handled one after the other (see `mlp.blocks`)."""
-        rows = blocks(torch.arange(self.ends.shape[1], device=self.ends.device), hidden)
-        if len(rows) == 1:
-            return [self]
-        optional = (None if x is None else x.split(len(rows[0])) for x in (self.wall_vel, self.share))
-        lots = [[None] * len(rows) if lot is None else lot for lot in optional]
-        sides = (self.ends.split(len(rows[0]), 1), self.scalars.split(len(rows[0])), self.basis.split(len(rows[0])))
-        return [Contacts(*piece) for piece in zip(*sides, *lots, strict=True)]
+        """As pieces that are best handled one after the other, in numbers that come again (see `models.mlp`)."""
+        always = [blocks(side, hidden) for side in (self.ends.T, self.scalars, self.basis)]
+        perhaps = [None if side is None else blocks(side, hidden) for side in (self.wall_vel, self.share)]
+        found = []
+        for number, (ends, scalars, basis) in enumerate(zip(*always, strict=True)):
+            wall_vel, share = (None if lot is None else recurring(lot[number], ROWS) for lot in perhaps)
+            ends, n = recurring(ends, ROWS).T, len(ends)
+            found.append(Contacts(ends, recurring(scalars, ROWS), recurring(basis, ROWS), wall_vel, share, n))
+        return found
 
 
 class ImpulseNetwork(nn.Module):
@@ -140,14 +144,16 @@ class ImpulseRound(MessagePassing):
         heard = 0 if self.update_mlp is None else self.hidden
         gained = carried.new_zeros(n, heard + 6 * self.channels)
         for piece, before in zip(contacts, edges, strict=True):
-            edge, message, impulse, turn = self.edge_update(piece, before, latent, carried)
-            to, rows = piece.ends, torch.cat([message[:, :heard], impulse.flatten(1), turn.flatten(1)], dim=1)
-            if piece.share is not None:
-                rows[:, heard:] *= piece.share[:, 1:]
+            edge, *told = self.edge_update(piece, before, latent, carried)
+            message, impulse, turn = (part[: piece.n].flatten(1) for part in told)
+            to, share = piece.ends[:, : piece.n], None if piece.share is None else piece.share[: piece.n]
+            rows = torch.cat([message[:, :heard], impulse, turn], dim=1)
+            if share is not None:
+                rows[:, heard:] *= share[:, 1:]
             if self.mutual:
-                back = torch.cat([message[:, :heard], -impulse.flatten(1), turn.flatten(1)], dim=1)
-                if piece.share is not None:
-                    back[:, heard:] *= piece.share[:, :1]
+                back = torch.cat([message[:, :heard], -impulse, turn], dim=1)
+                if share is not None:
+                    back[:, heard:] *= share[:, :1]
                 to, rows = torch.cat([to, to.flip(0)], dim=1), torch.cat([rows, back])
             if len(contacts) == 1:
                 gained = self.propagate(to, rows=rows.to(gained.dtype), size=(n, n))
@@ -159,7 +165,7 @@ class ImpulseRound(MessagePassing):
         if self.update_mlp is not None:  # of those that hear: a network that reaches nobody changes nothing
             hears = torch.zeros(n, dtype=torch.bool, device=there.device)
             for piece in contacts:
-                for end in piece.ends if self.mutual else piece.ends[1:]:
+                for end in piece.ends[0 if self.mutual else 1 :, : piece.n]:
                     hears.index_fill_(0, end, True)
             updated = there + self.update_mlp(torch.cat([there, gained[:, :heard]], dim=1))
             there = torch.where(hears[:, None], updated, there)

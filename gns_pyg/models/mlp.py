@@ -54,3 +54,11 @@ def linear(layer: nn.Linear, rows: Tensor, *, relu: bool = False) -> Tensor:
 def blocks(rows: Tensor, width: int, dim: int = 0) -> tuple[Tensor, ...]:
     """`rows` in pieces that are best handled one after the other at this width; a GPU takes all at once."""
     return rows.split(max(1, BLOCK // width), dim) if rows.device.type == "cpu" else (rows,)
+
+
+def recurring(rows: Tensor, multiple: int, value: int = 0) -> Tensor:
+    """`rows` and at least one more of `value`, so that their number comes again in other steps; where it matters:
+    oneDNN builds a kernel for every new number, which takes longer than its use."""
+    if len(rows) == 0 or rows.device.type != "cpu" or torch.is_grad_enabled():
+        return rows
+    return torch.cat([rows, rows.new_full((multiple - len(rows) % multiple, *rows.shape[1:]), value)])
