@@ -23,7 +23,7 @@ from gns_pyg.dynamics.tiles import tiles
 from gns_pyg.graph import contacts, features
 from gns_pyg.graph.neighbors import backend, pairs
 from gns_pyg.models.contact_network import ContactNetwork
-from gns_pyg.models.impulse_network import GAINED, MEAN, VELOCITY, Grains, ImpulseNetwork, exchange
+from gns_pyg.models.impulse_network import GAINED, MEAN, VELOCITY, Damping, Grains, ImpulseNetwork, exchange
 from gns_pyg.models.mlp import mlp
 from gns_pyg.models.statistics import Statistics
 from gns_pyg.scene.boundary_points import BoundaryPoints
@@ -99,11 +99,17 @@ class Simulator(nn.Module):
 
     def _build_impulse_networks(self) -> None:
         config, requires = self.config, self.requires
+        known = "true: impulses are what contacts add to free flight"
+        require(
+            requires.free_flight, "requires.free_flight", "false with model.network=impulse", known, "set it to auto"
+        )
         width = {key: getattr(config, key) for key in ("hidden", "layers", "mlp_layers", "channels")}
         n_grain = 2 + requires.radius_features + len(self._conditions)
         self.encode_grain = mlp(n_grain, config.hidden, config.hidden, config.mlp_layers, layer_norm=True)
         n_scalar, n_basis = contacts.N_SCALARS, contacts.N_BASIS
         self.grain_network = ImpulseNetwork(n_scalar=n_scalar, n_basis=n_basis, mutual=True, **width)
+        if requires.damped:
+            self.damping = Damping(config.hidden, config.channels)
         if requires.wall_network:
             n_scalar, n_basis = contacts.N_WALL_SCALARS + requires.wall_friction, contacts.N_WALL_BASIS
             self.wall_network = ImpulseNetwork(n_scalar=n_scalar, n_basis=n_basis, mutual=False, **width)
@@ -192,10 +198,11 @@ class Simulator(nn.Module):
         return total
 
     def _impulses(self, state: State, graph: Graph) -> Float[Tensor, "n_grains d"]:
-        """Two networks that take turns on the same grains, from what these would do without contact."""
-        velocity_m_s, dtype = self.statistics.velocity_m_s, self.scale.dtype
-        free_vel = self.integrator.without_contact(state).vel
-        options: dict[str, Any] = dict(velocity_m_s=velocity_m_s, dt_s=self.scene.frame_dt_s, dtype=dtype)
+        """Two networks that take turns on the same grains, from what these would do under gravity alone."""
+        velocity_m_s, dtype, dt_s = self.statistics.velocity_m_s, self.scale.dtype, self.scene.frame_dt_s
+        free_vel = state.vel + constant(self.scene.gravity_m_s2, state.vel) * dt_s
+        options: dict[str, Any] = dict(velocity_m_s=velocity_m_s, dt_s=dt_s, dtype=dtype)
+        options["slow"] = slow = contacts.FINE * self.scene.grains.radii_m[0] / dt_s / velocity_m_s
         grains = self._grains(state, free_vel)
         unlike = len(self.scene.grains.radii_m) > 1
         assert isinstance(self.grain_network, ImpulseNetwork)
@@ -205,10 +212,36 @@ class Simulator(nn.Module):
             kinds.append((self.wall_network, contacts.wall_contacts(state, free_vel, graph, graph.walls, **options)))
         after = exchange(grains, kinds)
         vel, spin = after.vel - grains.vel, after.spin - grains.spin
-        groups = [vel[:, :, MEAN], vel[:, :, VELOCITY]]
-        if state.ang_vel is not None:
-            groups.append((spin[:, :, VELOCITY] + spin[:, :, MEAN]) / state.radius[:, None].to(dtype))
+        groups = [vel[:, :, MEAN], vel[:, :, VELOCITY], spin[:, :, VELOCITY] + spin[:, :, MEAN]]
+        if self.requires.damped:
+            groups = self._damped(state, free_vel, graph, groups, self.damping(grains, after, slow))
+        groups[2] = groups[2] / state.radius[:, None].to(dtype)
         return torch.cat(groups[: self.integrator.n_groups], dim=1) * velocity_m_s / self.scale
+
+    def _damped(
+        self,
+        state: State,
+        free_vel: Float[Tensor, "n_grains 3"],
+        graph: Graph,
+        groups: list[Float[Tensor, "n_grains 3"]],
+        shares: Float[Tensor, "n_grains 5"],
+    ) -> list[Float[Tensor, "n_grains 3"]]:
+        """What damping leaves of what contacts have changed, of grains that something reaches: back comes what damping
+        takes from gravity in free flight, as far as others bear a grain; a share of its motion goes."""
+        free, velocity_m_s = self.integrator.without_contact(state), self.statistics.velocity_m_s
+        spin = torch.zeros_like(free_vel) if state.ang_vel is None else state.radius[:, None] * state.ang_vel
+        without = [(state.vel + free_vel) / 2, free_vel, spin]  # undamped
+        taken = [without[0] - (free.pos - state.pos) / self.scene.frame_dt_s, without[1] - free.vel]
+        without, taken = ([(x / velocity_m_s).to(shares.dtype) for x in xs] for xs in (without, taken))
+        reached = torch.zeros_like(state.batch, dtype=torch.bool)
+        for rows in (*graph.grain_edges, graph.wall_edges[1]):
+            reached = reached.index_fill(0, rows, True)
+        borne, slowed = shares[:, Damping.BORNE], shares[:, Damping.SLOWED]
+        found = []
+        for k, (given, own) in enumerate(zip(groups, without, strict=True)):
+            left = given - slowed[:, k, None] * (own + given)
+            found.append(left + borne[:, k, None] * taken[k] if k < len(taken) else left)
+        return [torch.where(reached[:, None], left, 0.0) for left in found]
 
     def _grains(self, state: State, free_vel: Float[Tensor, "n_grains 3"]) -> Grains:
         """What grains carry into the first round: their speeds, and what they would do without contact."""

@@ -9,13 +9,12 @@ from jaxtyping import Float
 from torch import Tensor
 
 from gns_pyg.graph.features import dot
-from gns_pyg.models.impulse_network import Contacts
+from gns_pyg.models.impulse_network import Contacts, fine
 from gns_pyg.state import Graph, State, Walls
 
-N_SCALARS, N_WALL_SCALARS = 9, 11
+N_SCALARS, N_WALL_SCALARS = 11, 13
 N_BASIS, N_WALL_BASIS = 2, 3
-FINE = 1e-3  # of a radius: an overlap that bears a few grains
-SLOW = 0.02  # of the data's velocity: slower slip has no sharp direction
+FINE = 1e-3  # of a radius: an overlap that bears a few grains; slip that is slower than this in a frame is slow
 
 
 def grain_contacts(
@@ -24,6 +23,7 @@ def grain_contacts(
     graph: Graph,
     *,
     unlike: bool,
+    slow: float,
     velocity_m_s: float,
     dt_s: float,
     dtype: torch.dtype,
@@ -35,6 +35,7 @@ def grain_contacts(
         free_vel: their velocity a frame later if nothing touched, m/s.
         graph: pairs in one direction.
         unlike: masses differ.
+        slow: see `Contacts`.
         velocity_m_s, dt_s: the data's velocity scale and the frame.
         dtype: the networks'.
     """
@@ -48,13 +49,13 @@ def grain_contacts(
         arm = state.radius[:, None] * state.ang_vel
         slip = rel_vel - torch.linalg.cross(arm.index_select(0, sender) + arm.index_select(0, receiver), normal)
     ahead = torch.linalg.vector_norm(rel_pos + rel_vel * dt_s, dim=1)
-    scalars, sideways = _scalars(distance, distance - touch, ahead - touch, slip, normal, radius, velocity_m_s)
+    scalars, sideways = _scalars(distance, distance - touch, ahead - touch, slip, normal, radius, velocity_m_s, dt_s)
     share = None
     if unlike:
         mass = torch.stack([state.radius[receiver], state.radius[sender]], dim=1) ** 3
         share = (2 * mass / mass.sum(1, keepdim=True)).to(dtype)
     basis = torch.stack([normal, sideways], dim=2)
-    return Contacts(graph.grain_edges, scalars.to(dtype), basis.to(dtype), share=share)
+    return Contacts(graph.grain_edges, scalars.to(dtype), basis.to(dtype), slow, share=share)
 
 
 def wall_contacts(
@@ -65,6 +66,7 @@ def wall_contacts(
     *,
     friction: bool,
     channels: int,
+    slow: float,
     velocity_m_s: float,
     dt_s: float,
     dtype: torch.dtype,
@@ -86,7 +88,7 @@ def wall_contacts(
     if state.ang_vel is not None:
         slip = rel_vel - torch.linalg.cross((state.radius[:, None] * state.ang_vel).index_select(0, grain), normal)
     ahead = height + dot(rel_vel, normal) * dt_s
-    scalars, sideways = _scalars(distance, height - radius, ahead - radius, slip, normal, radius, velocity_m_s)
+    scalars, sideways = _scalars(distance, height - radius, ahead - radius, slip, normal, radius, velocity_m_s, dt_s)
     aside = torch.linalg.vector_norm(rel_pos - height[:, None] * normal, dim=1, keepdim=True) / radius[:, None]
     columns = [scalars, aside, aside.square()]
     if friction:
@@ -94,19 +96,27 @@ def wall_contacts(
     towards = rel_pos / torch.maximum(distance, 1e-3 * radius)[:, None]
     moving = torch.cat([(wall_vel / velocity_m_s)[:, :, None], rel_pos.new_zeros(len(point), 3, channels - 1)], dim=2)
     basis = torch.stack([normal, sideways, towards], dim=2)
-    return Contacts(graph.wall_edges, torch.cat(columns, dim=1).to(dtype), basis.to(dtype), moving.to(dtype))
+    return Contacts(graph.wall_edges, torch.cat(columns, dim=1).to(dtype), basis.to(dtype), slow, moving.to(dtype))
 
 
 def _scalars(
-    distance: Tensor, gap: Tensor, ahead: Tensor, slip: Tensor, normal: Tensor, radius: Tensor, velocity_m_s: float
+    distance: Tensor,
+    gap: Tensor,
+    ahead: Tensor,
+    slip: Tensor,
+    normal: Tensor,
+    radius: Tensor,
+    velocity_m_s: float,
+    dt_s: float,
 ) -> tuple[Tensor, Tensor]:
-    """Nine scalars, and the direction of the slip, which fades where there is none."""
+    """The scalars that all contacts have, and the direction of the slip, which fades where there is none."""
     approach = dot(slip, normal)
     tangential = slip - approach[:, None] * normal
     speed = torch.linalg.vector_norm(tangential, dim=1)
     near = radius / torch.maximum(distance, 0.1 * radius)
     gap, ahead = gap / radius, ahead / radius
-    fine = [torch.asinh(x / FINE) / 4 for x in (gap, ahead)]
-    columns = [distance / radius, near, near**2, gap, ahead, *fine, approach / velocity_m_s, speed / velocity_m_s]
-    sideways = tangential / (speed.square() + (SLOW * velocity_m_s) ** 2).sqrt()[:, None]
+    slow_m_s = FINE * radius / dt_s
+    finely = [fine(gap, FINE), fine(ahead, FINE), *(fine(v / slow_m_s, 1.0) for v in (approach, speed))]
+    columns = [distance / radius, near, near**2, gap, ahead, approach / velocity_m_s, speed / velocity_m_s, *finely]
+    sideways = tangential / (speed.square() + slow_m_s.square()).sqrt()[:, None]
     return torch.stack(columns, dim=1), sideways

@@ -49,6 +49,7 @@ class Contacts:
         ends: [sender, receiver]; of a boundary point only the receiver is a row of `Grains`.
         scalars: what stays when everything is turned, (n_contacts, n_scalars).
         basis: the contact's directions, columns; first the unit normal, from the receiver to the other side.
+        slow: dimensionless velocity below which the networks need a finer scale.
         wall_vel: dimensionless velocity of the boundary point, one vector a channel; None between grains.
         share: how much more than its partner sender and receiver are moved by the same impulse: 2 m' / (m + m') with m'
             the partner's mass; None where all masses are equal.
@@ -58,6 +59,7 @@ class Contacts:
     ends: Int[Tensor, "2 e"]
     scalars: Float[Tensor, "e f"]
     basis: Float[Tensor, "e 3 b"]
+    slow: float
     wall_vel: Float[Tensor, "e 3 channels"] | None = None
     share: Float[Tensor, "e 2"] | None = None
     n: int | None = None
@@ -70,7 +72,8 @@ class Contacts:
         for number, (ends, scalars, basis) in enumerate(zip(*always, strict=True)):
             wall_vel, share = (None if lot is None else recurring(lot[number], ROWS) for lot in perhaps)
             ends, n = recurring(ends, ROWS).T, len(ends)
-            found.append(Contacts(ends, recurring(scalars, ROWS), recurring(basis, ROWS), wall_vel, share, n))
+            filled = recurring(scalars, ROWS), recurring(basis, ROWS)
+            found.append(Contacts(ends, *filled, self.slow, wall_vel, share, n))
         return found
 
 
@@ -123,14 +126,14 @@ class ImpulseRound(MessagePassing):
     def __init__(self, hidden: int, mlp_layers: int, channels: int, n_basis: int, *, mutual: bool, last: bool) -> None:
         super().__init__(aggr="sum", flow="source_to_target")
         self.hidden, self.channels, self.mutual = hidden, channels, mutual
-        n_seen = channels * (n_basis + 1)
-        self.from_seen = nn.Linear(n_seen, hidden)
+        n_given = channels * (n_basis + 1)
+        self.from_seen = nn.Linear(2 * n_given, hidden)
         self.from_ends = nn.Linear(hidden, hidden, bias=False)  # a pair looks the same from either side
         self.from_edge = nn.Linear(hidden, hidden, bias=False)
         for part in (self.from_seen, self.from_ends, self.from_edge):
             nn.init.uniform_(part.weight, -((3 * hidden) ** -0.5), (3 * hidden) ** -0.5)  # as one layer of 3 x hidden
         self.message_mlp = mlp(hidden, hidden, hidden, mlp_layers - 1, layer_norm=True)
-        self.impulse_mlp = mlp(hidden, hidden, n_seen, 2)
+        self.impulse_mlp = mlp(hidden, hidden, n_given, 2)
         with torch.no_grad():  # begin near free flight
             for parameter in self.impulse_mlp[-1].parameters():
                 parameter.mul_(0.1)
@@ -190,6 +193,7 @@ class ImpulseRound(MessagePassing):
         along = (basis[:, :, :, None] * slip[:, :, None, :]).sum(1)
         speed = (slip.square().sum(1) + SOFT).sqrt()
         seen = torch.cat([along.flatten(1), speed], dim=1)
+        seen = torch.cat([seen, fine(seen, contacts.slow)], dim=1)
         message = self.message_mlp((hidden + linear(self.from_edge, edge) + linear(self.from_seen, seen)).relu_())
         edge = edge + message
         factors = self.impulse_mlp(edge).view(len(edge), n_basis + 1, self.channels)
@@ -200,6 +204,36 @@ class ImpulseRound(MessagePassing):
 
     def message(self, rows: Tensor) -> Tensor:
         return rows
+
+
+class Damping(nn.Module):
+    """What a DEM's damping leaves of that. Cundall's takes from every force that speeds a grain up and adds to those that
+    slow it down, which no two grains give each other. How much in a frame is learned, as shares of what is known.
+
+    Args:
+        hidden, channels: see `ImpulseNetwork`.
+    """
+
+    BORNE, SLOWED = slice(0, 2), slice(2, 5)  # shares of: gravity's damping given back; mean, end velocity, spin lost
+
+    def __init__(self, hidden: int, channels: int) -> None:
+        super().__init__()
+        self.shares = mlp(hidden + 6 * channels, hidden, 5, 2)
+        with torch.no_grad():  # begin with little
+            final = list(self.shares[-1].parameters())[-1]
+            final.fill_(-3.0)
+
+    def forward(self, before: Grains, after: Grains, slow: float) -> Float[Tensor, "n 5"]:
+        """Shares between 0 and 1."""
+        lengths = []
+        for old, new in ((before.vel, after.vel), (before.spin, after.spin)):
+            lengths += [(x.square().sum(1) + SOFT * slow).sqrt() for x in (old, new, new - old)]
+        return self.shares(torch.cat([after.latent, fine(torch.cat(lengths, dim=1), slow)], dim=1)).sigmoid()
+
+
+def fine(values: Tensor, unit: float) -> Tensor:
+    """On a scale that is linear up to `unit` and logarithmic beyond."""
+    return torch.asinh(values / unit) / 4
 
 
 def exchange(grains: Grains, kinds: Sequence[tuple[ImpulseNetwork, Contacts]]) -> Grains:

@@ -30,6 +30,7 @@ class Requires:
     symmetry: Union[bool, str] = "auto"
     active_mask: Union[bool, str] = "auto"
     rest: Union[bool, str] = "auto"
+    damped: Union[bool, str] = "auto"
     state: str = "auto"
 
     def __post_init__(self) -> None:
@@ -57,6 +58,7 @@ class Requirements:
         symmetry: training windows are turned and mirrored by the scene's own symmetry.
         active_mask: grains leave or enter.
         rest: a grain that stands stays (see `dynamics.rest`).
+        damped: the DEM's damping takes from what grains give each other; impulse networks learn how much.
         state: what the state holds (see `dynamics.integrator`).
         reasons: row -> why, for people.
     """
@@ -74,6 +76,7 @@ class Requirements:
     active_mask: bool
     state: str
     rest: bool = False  # bundles made before have none
+    damped: bool = False  # nor this
     reasons: dict[str, str] = field(default_factory=dict)
 
     def __str__(self) -> str:
@@ -189,8 +192,15 @@ def _derive(scene: Scene, parameters: Mapping[str, Sequence[float]]) -> dict[str
         "symmetry": (not own.trivial, own.describe()),
         "active_mask": (bool(passing), " and ".join(passing) or "no grain leaves or enters: no mask"),
         "rest": (stands(scene), _standing(scene, moving)),
+        "damped": _damped(scene, varying),
         "state": (scene.state, "as data_gen.restart measured it (docs/state.md)"),
     }
+
+
+def _damped(scene: Scene, varying: Sequence[str]) -> tuple[bool, str]:
+    if "damping" in varying:
+        return True, "damping varies"
+    return scene.damping > 0, f"damping {scene.damping:g} acts on every grain" if scene.damping else "no damping"
 
 
 def _standing(scene: Scene, moving: Sequence[str]) -> str:

@@ -18,9 +18,10 @@ WALLS = {"shape": {"kind": "box", "size_m": [0.15, 0.15, 0.15], "center_m": [0.0
 STATES = ("full", "velocity", "differences")
 
 
-def model(walls=False, radii=None, **changes):
+def model(walls=False, radii=None, gravity=9.81, damping=0.0, **changes):
     boundary = {"walls": WALLS | {"friction_angle_rad": 0.5}} if walls else {}
-    scene = scenes.scene(40, 5, boundary=boundary)
+    scene = scenes.scene(40, 5, boundary=boundary, damping=damping)
+    scene = replace(scene, gravity_m_s2=[0.0, 0.0, -gravity])
     if radii:
         scene = replace(scene, grains=replace(scene.grains, radius_m=list(radii)))
     return simulator(scene, dtype=torch.float64, **(IMPULSE | changes))
@@ -47,8 +48,9 @@ def test_unlike_masses_exchange_momentum_and_spin_by_their_inertia():
 
 @pytest.mark.parametrize("walls", [False, True])
 @pytest.mark.parametrize("mirrored", [False, True])
-def test_what_is_turned_or_mirrored_comes_out_turned_or_mirrored(walls, mirrored):
-    network, start = model(walls), state_in_box([40])
+@pytest.mark.parametrize("damping", [0.0, 0.2])
+def test_what_is_turned_or_mirrored_comes_out_turned_or_mirrored(walls, mirrored, damping):
+    network, start = model(walls, gravity=0.0, damping=damping), state_in_box([40])
     q = torch.from_numpy(Rotation.from_euler("xyz", [0.3, 1.1, -2.0]).as_matrix())
     q, hand = (-q, -1.0) if mirrored else (q, 1.0)
     graph = network.graph(start)
@@ -57,20 +59,9 @@ def test_what_is_turned_or_mirrored_comes_out_turned_or_mirrored(walls, mirrored
     if graph.walls is not None:
         w = graph.walls
         other = replace(graph, walls=Walls(w.pos @ q.T, w.normal @ q.T, w.vel @ q.T, w.friction_angle))
-    network.integrator = NoGravity(network.integrator)
     expected = network.effects(start, graph).view(-1, 3, 3) @ q.T
     expected[:, 2] *= hand
     assert torch.allclose(network.effects(turned, other).view(-1, 3, 3), expected, atol=1e-10)
-
-
-class NoGravity:
-    """An integrator in whose free flight nothing falls: gravity's direction is not turned by the test."""
-
-    def __init__(self, integrator):
-        self.integrator, self.n_groups = integrator, integrator.n_groups
-
-    def without_contact(self, state):
-        return state
 
 
 def test_a_tangential_impulse_turns_both_grains_alike():
@@ -85,8 +76,9 @@ def test_a_tangential_impulse_turns_both_grains_alike():
     assert given[0, 6].abs() < 1e-12, "no twist about the normal"
 
 
-def test_grains_that_touch_nothing_get_exactly_zero():
-    network, start = model(walls=True, free_grains=False), state_in_box([40])
+@pytest.mark.parametrize("damping", [0.0, 0.2])
+def test_grains_that_touch_nothing_get_exactly_zero(damping):
+    network, start = model(walls=True, damping=damping, free_grains=False), state_in_box([40])
     far = replace(start, pos=torch.cat([start.pos[:-1] * 0.3, torch.tensor([[0.0, 0.0, 0.9]]).double()]))
     assert torch.equal(network.correction(far)[-1], torch.zeros(9).double())
 
@@ -107,8 +99,9 @@ def test_every_pair_is_there_once():
     assert both.shape[1] == 2 * len(sender)
 
 
-def test_gradients_are_finite_where_grains_coincide_and_stand_still():
-    network, start = model(walls=True), state_in_box([4])
+@pytest.mark.parametrize("damping", [0.0, 0.2])
+def test_gradients_are_finite_where_grains_coincide_and_stand_still(damping):
+    network, start = model(walls=True, damping=damping), state_in_box([4])
     pos = torch.zeros(4, 3).double().requires_grad_()
     still = torch.zeros_like(start.vel)
     network.correction(replace(start, pos=pos, vel=still, ang_vel=still)).sum().backward()
@@ -116,9 +109,10 @@ def test_gradients_are_finite_where_grains_coincide_and_stand_still():
     assert all(torch.isfinite(p.grad).all() for p in network.parameters() if p.grad is not None)
 
 
-def test_every_parameter_is_used():
+@pytest.mark.parametrize("damping", [0.0, 0.2])
+def test_every_parameter_is_used(damping):
     """Several processes that train together wait for the gradients of all."""
-    network = model(walls=True)
+    network = model(walls=True, damping=damping)
     network.correction(state_in_box([40])).square().sum().backward()
     assert all(p.grad is not None for p in network.parameters())
 
@@ -146,3 +140,23 @@ def test_rounds_see_what_earlier_rounds_have_changed():
         assert bool(moved) == reached
     assert isinstance(steps.exchange, type(impulse_network.exchange))
     assert Grains.__dataclass_fields__.keys() == {"latent", "vel", "spin"}
+
+
+def with_shares(network, share):
+    network.damping.forward = lambda before, after, slow: torch.full((len(after.latent), 5), share).double()
+    return network
+
+
+@pytest.mark.parametrize("state", STATES)
+def test_damping_takes_nothing_or_all(state):
+    """Shares of 1: no grain that something reaches moves any more; of 0: as if there were no damping to learn."""
+    start = state_in_box([40], spin=state == "full")
+    damped, plain = (model(walls=True, damping=0.2, state=state, **row) for row in ({}, {"damped": False}))
+    plain.load_state_dict({name: w for name, w in damped.state_dict().items() if not name.startswith("damping")})
+    assert torch.allclose(with_shares(damped, 0.0).correction(start), plain.correction(start), atol=1e-14)
+    graph = damped.graph(start)
+    reached = torch.cat([*graph.grain_edges, graph.wall_edges[1]]).unique()
+    after = damped.integrator.integrate(start, with_shares(damped, 1.0).correction(start) * damped.scale)
+    assert torch.allclose(after.pos[reached], start.pos[reached], atol=1e-12)
+    assert after.vel[reached].abs().max() < 1e-12
+    assert after.ang_vel is None or after.ang_vel[reached].abs().max() < 1e-10
