@@ -207,8 +207,8 @@ class ImpulseRound(MessagePassing):
 
 
 class Damping(nn.Module):
-    """What a DEM's damping leaves of that. Cundall's takes from every force that speeds a grain up and adds to those that
-    slow it down, which no two grains give each other. How much in a frame is learned, as shares of what is known.
+    """What a DEM's damping leaves of that. Cundall's takes from every force that speeds a grain up and adds to those
+    that slow it down, which no two grains give each other. How much in a frame is learned, as shares of what is known.
 
     Args:
         hidden, channels: see `ImpulseNetwork`.
