@@ -21,6 +21,11 @@ def constant(values: Sequence[float | int], like: Tensor) -> Tensor:
     return torch.stack([like.new_full((), value) for value in values])
 
 
+def fine(values: Tensor, unit: float) -> Tensor:
+    """On a scale that is linear up to `unit` and logarithmic beyond."""
+    return torch.asinh(values / unit) / 4
+
+
 class Record:
     """A frozen dataclass of tensors that can move between devices."""
 
@@ -152,3 +157,27 @@ class Graph(Record):
     grain_edges: Int[Tensor, "2 n_grain_edges"]
     wall_edges: Int[Tensor, "2 n_wall_edges"]
     walls: Walls | None = None
+
+
+@dataclass(frozen=True)
+class Contacts:
+    """Contacts of one kind; of a pair of grains one of the two directions.
+
+    Attributes:
+        ends: [sender, receiver]; of a boundary point only the receiver is a row of `Grains`.
+        scalars: what stays when everything is turned, (n_contacts, n_scalars).
+        basis: the contact's directions, columns; first the unit normal, from the receiver to the other side.
+        slow: dimensionless velocity below which the networks need a finer scale.
+        wall_vel: dimensionless velocity of the boundary point, one vector a channel; None between grains.
+        share: how much more than its partner sender and receiver are moved by the same impulse: 2 m' / (m + m') with m'
+            the partner's mass; None where all masses are equal.
+        n: how many of the rows are contacts, the first ones; None is all.
+    """
+
+    ends: Int[Tensor, "2 e"]
+    scalars: Float[Tensor, "e f"]
+    basis: Float[Tensor, "e 3 b"]
+    slow: float
+    wall_vel: Float[Tensor, "e 3 channels"] | None = None
+    share: Float[Tensor, "e 2"] | None = None
+    n: int | None = None

@@ -9,8 +9,7 @@ from jaxtyping import Float
 from torch import Tensor
 
 from gns_pyg.graph.features import dot
-from gns_pyg.models.impulse_network import Contacts, fine
-from gns_pyg.state import Graph, State, Walls
+from gns_pyg.state import Contacts, Graph, State, Walls, fine
 
 N_SCALARS, N_WALL_SCALARS = 11, 13
 N_BASIS, N_WALL_BASIS = 2, 3

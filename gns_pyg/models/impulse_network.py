@@ -11,18 +11,17 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import torch
-from jaxtyping import Float, Int
+from jaxtyping import Float
 from torch import Tensor, nn
 from torch_geometric.nn import MessagePassing
 
 from gns_pyg.models.mlp import blocks, linear, mlp, recurring
+from gns_pyg.state import Contacts, fine
 
 ROWS = 128  # of which contacts come in multiples, as in `contact_network`
 VELOCITY, MEAN, GAINED = 0, 1, 2  # channels: end velocity, mean velocity's correction, what gravity adds in a frame
 SPHERE = 2.5  # m r^2 / I: what a tangential impulse turns it
-FASTEST = (
-    30.0  # of the velocity scale: what answers a slip in proportion stays below, so that nothing grows without end
-)
+FASTEST = 30.0  # of the velocity scale: what answers a slip in proportion stays below; nothing grows without end
 SOFT = 1e-6  # under the root of a squared length, so that its gradient stays finite
 
 
@@ -39,42 +38,6 @@ class Grains:
     latent: Float[Tensor, "n hidden"]
     vel: Float[Tensor, "n 3 channels"]
     spin: Float[Tensor, "n 3 channels"]
-
-
-@dataclass(frozen=True)
-class Contacts:
-    """Contacts of one kind; of a pair of grains one of the two directions.
-
-    Attributes:
-        ends: [sender, receiver]; of a boundary point only the receiver is a row of `Grains`.
-        scalars: what stays when everything is turned, (n_contacts, n_scalars).
-        basis: the contact's directions, columns; first the unit normal, from the receiver to the other side.
-        slow: dimensionless velocity below which the networks need a finer scale.
-        wall_vel: dimensionless velocity of the boundary point, one vector a channel; None between grains.
-        share: how much more than its partner sender and receiver are moved by the same impulse: 2 m' / (m + m') with m'
-            the partner's mass; None where all masses are equal.
-        n: how many of the rows are contacts, the first ones; None is all.
-    """
-
-    ends: Int[Tensor, "2 e"]
-    scalars: Float[Tensor, "e f"]
-    basis: Float[Tensor, "e 3 b"]
-    slow: float
-    wall_vel: Float[Tensor, "e 3 channels"] | None = None
-    share: Float[Tensor, "e 2"] | None = None
-    n: int | None = None
-
-    def pieces(self, hidden: int) -> list["Contacts"]:
-        """As pieces that are best handled one after the other, in numbers that come again (see `models.mlp`)."""
-        always = [blocks(side, hidden) for side in (self.ends.T, self.scalars, self.basis)]
-        perhaps = [None if side is None else blocks(side, hidden) for side in (self.wall_vel, self.share)]
-        found = []
-        for number, (ends, scalars, basis) in enumerate(zip(*always, strict=True)):
-            wall_vel, share = (None if lot is None else recurring(lot[number], ROWS) for lot in perhaps)
-            ends, n = recurring(ends, ROWS).T, len(ends)
-            filled = recurring(scalars, ROWS), recurring(basis, ROWS)
-            found.append(Contacts(ends, *filled, self.slow, wall_vel, share, n))
-        return found
 
 
 class ImpulseNetwork(nn.Module):
@@ -231,16 +194,24 @@ class Damping(nn.Module):
         return self.shares(torch.cat([after.latent, fine(torch.cat(lengths, dim=1), slow)], dim=1)).sigmoid()
 
 
-def fine(values: Tensor, unit: float) -> Tensor:
-    """On a scale that is linear up to `unit` and logarithmic beyond."""
-    return torch.asinh(values / unit) / 4
+def pieces(contacts: Contacts, hidden: int) -> list[Contacts]:
+    """Contacts as pieces that are best handled one after the other, in numbers that come again (see `models.mlp`)."""
+    always = [blocks(side, hidden) for side in (contacts.ends.T, contacts.scalars, contacts.basis)]
+    perhaps = [None if side is None else blocks(side, hidden) for side in (contacts.wall_vel, contacts.share)]
+    found = []
+    for number, (ends, scalars, basis) in enumerate(zip(*always, strict=True)):
+        wall_vel, share = (None if lot is None else recurring(lot[number], ROWS) for lot in perhaps)
+        ends, n = recurring(ends, ROWS).T, len(ends)
+        filled = recurring(scalars, ROWS), recurring(basis, ROWS)
+        found.append(Contacts(ends, *filled, contacts.slow, wall_vel, share, n))
+    return found
 
 
 def exchange(grains: Grains, kinds: Sequence[tuple[ImpulseNetwork, Contacts]]) -> Grains:
     """What grains carry after all rounds, in which the kinds of contact take turns."""
-    pieces = [contacts.pieces(network.hidden) for network, contacts in kinds]
+    lots = [pieces(contacts, network.hidden) for network, contacts in kinds]
     edges: list[list[Tensor] | None] = [None] * len(kinds)
     for turn in range(len(kinds[0][0].rounds)):
         for kind, (network, _) in enumerate(kinds):
-            grains, edges[kind] = network(turn, grains, pieces[kind], edges[kind])
+            grains, edges[kind] = network(turn, grains, lots[kind], edges[kind])
     return grains
