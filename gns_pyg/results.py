@@ -141,11 +141,17 @@ def long_runs(name: str, scene: Scene) -> dict[str, Any]:
     Returns:
         `duration_s`; per case `angle_of_repose_deg`, mean over the steady part, and its `_standard_error_deg`, each
         with `_dem`; `escaped_grains`, the most at any frame; `late_mean_speed_m_s` over the last half, and `_dem`.
+
+    Raises:
+        DataError: for a case that starts as one that the bundle was trained on.
     """
-    simulator, cases = bundle.load(name), []
+    simulator, card, cases = bundle.load(name), bundle.card(name), []
     for path in sorted((EMBEDDED / f"{scene.name}_long").glob("case_*.h5")):
         log.info("long: %s", path.name)
         case = open_to_compare(path, scene)
+        if seen(case, scene, card):
+            remedy = "train without the case that starts alike"
+            raise DataError(path, "a start that the bundle was trained on", "one that it has not seen", remedy)
         start = start_frame(case, START_S)
         times_s, pos = case.times_s[start:], roll_out(simulator, case, start)[0]
         half = len(times_s) // 2

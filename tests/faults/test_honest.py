@@ -7,14 +7,14 @@ import pytest
 import torch
 
 from gns_pyg import bundle, run
-from gns_pyg.data.datamodule import DataConfig, split
+from gns_pyg.data.datamodule import EMBEDDED, DataConfig, open_to_compare, split
 from gns_pyg.data.statistics import measure
 from gns_pyg.dynamics.integrator import Integrator
 from gns_pyg.errors import ConfigError, DataError
 from gns_pyg.evaluation.judge import judge
 from gns_pyg.evaluation.metrics import write_json
 from gns_pyg.evaluation.twins import read_twins, twins_path
-from gns_pyg.results import BUNDLES, kept_for_testing, own_cases
+from gns_pyg.results import BUNDLES, kept_for_testing, long_runs, own_cases
 from gns_pyg.scene.scene import Scene
 from tests.faults import samples
 
@@ -116,3 +116,13 @@ def test_nothing_is_sent_over_the_network(data, tmp_path):
         assert WATCHED == ["on"]
     finally:
         WATCHED.clear()
+
+
+def test_a_long_run_that_starts_as_a_training_case_does_not_judge(monkeypatch):
+    """Cases of a longer scene are recorded anew: only their start tells that a bundle has seen their first seconds."""
+    scene, card = bundle.load("hopper").scene, bundle.card("hopper")
+    path = EMBEDDED / "hopper_small_long" / "case_020.h5"
+    start = open_to_compare(path, scene).start()
+    monkeypatch.setattr(bundle, "card", lambda name: card | {"starts": [*card["starts"], start]})
+    with pytest.raises(DataError, match=r"case_020\.h5"):
+        long_runs("hopper", scene)
