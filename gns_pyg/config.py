@@ -6,9 +6,8 @@ from pathlib import Path
 from typing import Any, TypeVar, cast
 
 from omegaconf import OmegaConf
-from omegaconf.errors import OmegaConfBaseException
 
-from gns_pyg.errors import ConfigError
+from gns_pyg.errors import ConfigError, GnsError
 
 CONF = str(Path(__file__).resolve().parent / "conf")
 
@@ -32,7 +31,9 @@ def typed(record: type[Record], values: Any, where: str) -> Record:
         told = OmegaConf.to_container(values, resolve=True) if OmegaConf.is_config(values) else values
         merged = OmegaConf.merge(OmegaConf.structured(record), told)
         return cast(Record, OmegaConf.to_object(merged))
-    except (OmegaConfBaseException, OverflowError) as error:  # the latter: a whole number too large for a float
+    except GnsError:
+        raise
+    except Exception as error:  # OmegaConf's own, and whatever a record trips over that is given something else
         key = getattr(error, "full_key", None)
         reason = str(error).splitlines()[0]
         known = ", ".join(field.name for field in fields(record))  # type: ignore[arg-type]

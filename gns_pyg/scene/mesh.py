@@ -16,6 +16,7 @@ from gns_pyg.errors import GeometryError
 from gns_pyg.scene.scene import Part, finite, positive
 
 PACKAGE = Path(CONF).parent
+FARTHEST_M = 1e9
 BLOCK = 20_000  # point-triangle pairs handled at once: few enough to stay in the processor's cache
 
 
@@ -180,7 +181,12 @@ def build_mesh(name: str, part: Part) -> Trimesh:
     kind = shape.pop("kind", None)
     require(isinstance(kind, str) and kind in SHAPES, f"{where}.kind", kind, " or ".join(SHAPES), "pick one of them")
     record: Any = typed(SHAPES[kind], shape, where)
-    mesh: Trimesh = record.mesh(where)
+    with np.errstate(over="ignore"):  # refused below
+        mesh: Trimesh = record.mesh(where)
+    farthest_m, most = float(np.abs(mesh.vertices).max()), f"at most {FARTHEST_M:g} m from the origin"
+    require(
+        farthest_m <= FARTHEST_M, where, f"a corner {farthest_m:g} m away", most, "check its unit: lengths are in m"
+    )
     if mesh.is_watertight and mesh.volume < 0:
         if kind == "file":
             raise GeometryError(

@@ -234,3 +234,9 @@ def test_a_file_that_is_no_mesh_is_refused(tmp_path) -> None:
     (tmp_path / "drum.stl").write_text("solid nothing\nendsolid nothing\n")
     with pytest.raises(GeometryError, match=r"drum\.stl"):
         build_mesh("drum", part(kind="file", path=str(tmp_path / "drum.stl")))
+
+
+def test_a_part_as_large_as_nothing_on_earth_is_refused() -> None:
+    """Squares of such lengths are no numbers any more."""
+    with pytest.raises(ConfigError, match=r"scene\.boundary\.walls\.shape"):
+        build_mesh("walls", part(kind="box", size_m=[1e200, 1.0, 1.0]))

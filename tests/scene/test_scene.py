@@ -202,3 +202,9 @@ def test_grains_cannot_enter_beyond_the_outlet() -> None:
     outlet = {"point_m": [0, 0, 2], "normal": [0, 0, -1]}
     with pytest.raises(ConfigError, match="not beyond the outlet"):
         scenes.scene(5, 5, inlet=INLET, outlet=outlet)
+
+
+def test_a_record_that_is_given_a_word_is_refused_by_key() -> None:
+    """Optional records are told apart by nothing but their content."""
+    with pytest.raises(ConfigError, match="scene"):
+        scenes.scene(2, 5, angle_of_repose="steep")
