@@ -35,7 +35,7 @@ def typed(record: type[Record], values: Any, where: str) -> Record:
         raise
     except Exception as error:  # OmegaConf's own, and whatever a record trips over that is given something else
         key = getattr(error, "full_key", None)
-        reason = str(error).splitlines()[0]
+        reason = (str(error) or type(error).__name__).splitlines()[0]
         known = ", ".join(field.name for field in fields(record))  # type: ignore[arg-type]
         raise ConfigError(
             f"{where}.{key}" if key else where,

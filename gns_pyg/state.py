@@ -21,9 +21,17 @@ def constant(values: Sequence[float | int], like: Tensor) -> Tensor:
     return torch.stack([like.new_full((), value) for value in values])
 
 
-def fine(values: Tensor, unit: float) -> Tensor:
+def fine(values: Tensor, unit: Tensor | float) -> Tensor:
     """On a scale that is linear up to `unit` and logarithmic beyond."""
     return torch.asinh(values / unit) / 4
+
+
+def reached(n: int, *rows: Int[Tensor, " _"]) -> Bool[Tensor, " n"]:
+    """Which of `n` grains are named in `rows`."""
+    found = torch.zeros(n, dtype=torch.bool, device=rows[0].device)
+    for named in rows:
+        found = found.index_fill(0, named, True)
+    return found
 
 
 class Record:
@@ -149,7 +157,7 @@ class Graph(Record):
     """Who can touch whom.
 
     Attributes:
-        grain_edges: [sender grain, receiver grain]; both directions of every pair, one where a network of pairs asks.
+        grain_edges: [sender grain, receiver grain]; both directions of every pair, or one (see `Simulator.pairs_once`).
         wall_edges: [boundary point (row of `walls`), receiver grain]; walls only send.
         walls: the boundary points, or None where the scene has no boundary.
     """

@@ -104,7 +104,7 @@ class Captured:
             free_pos = simulator.integrator.without_contact(everyone).pos
             near = can_touch(everyone, free_pos, graph, simulator.scene.frame_dt_s)
             graph = _among(graph, near, nobody, nothing)
-        if simulator.config.network == "impulse":
+        if simulator.pairs_once:
             edges = graph.grain_edges
             graph = replace(graph, grain_edges=_only(edges, edges[0] < edges[1], nobody))
         return graph, torch.stack(needed)

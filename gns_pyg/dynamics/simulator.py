@@ -29,7 +29,7 @@ from gns_pyg.models.statistics import Statistics
 from gns_pyg.scene.boundary_points import BoundaryPoints
 from gns_pyg.scene.requirements import Requirements
 from gns_pyg.scene.scene import PARAMETERS, Scene
-from gns_pyg.state import Graph, State, Walls, constant
+from gns_pyg.state import Graph, State, Walls, constant, reached
 
 FARTHEST = 20.0  # standard deviations of the training cases' positions
 
@@ -156,8 +156,7 @@ class Simulator(nn.Module):
         return (self.integrator.target(state, following) / self.scale).to(self.scale.dtype)
 
     def correction(self, state: State) -> Float[Tensor, "n_grains d"]:
-        """What contacts add, over `scale`: the sum of both networks (the paper's equation (10)); 0 for a grain that
-        is not active."""
+        """What contacts add, over `scale`; 0 for a grain that is not active."""
         if state.active is None:
             return self._contacts(state)
         there = self._contacts(replace(state.pick(state.active), active=None))
@@ -233,15 +232,13 @@ class Simulator(nn.Module):
         without = [(state.vel + free_vel) / 2, free_vel, spin]  # undamped
         taken = [without[0] - (free.pos - state.pos) / self.scene.frame_dt_s, without[1] - free.vel]
         without, taken = ([(x / velocity_m_s).to(shares.dtype) for x in xs] for xs in (without, taken))
-        reached = torch.zeros_like(state.batch, dtype=torch.bool)
-        for rows in (*graph.grain_edges, graph.wall_edges[1]):
-            reached = reached.index_fill(0, rows, True)
+        touched = reached(len(state.pos), *graph.grain_edges, graph.wall_edges[1])
         borne, slowed = shares[:, Damping.BORNE], shares[:, Damping.SLOWED]
         found = []
         for k, (given, own) in enumerate(zip(groups, without, strict=True)):
             left = given - slowed[:, k, None] * (own + given)
             found.append(left + borne[:, k, None] * taken[k] if k < len(taken) else left)
-        return [torch.where(reached[:, None], left, 0.0) for left in found]
+        return [torch.where(touched[:, None], left, 0.0) for left in found]
 
     def _grains(self, state: State, free_vel: Float[Tensor, "n_grains 3"]) -> Grains:
         """What grains carry into the first round: their speeds, and what they would do without contact."""
@@ -259,6 +256,11 @@ class Simulator(nn.Module):
     def settles(self) -> bool:
         """Whether a state that a step leaves as it was stays so: nothing drives it from outside."""
         return self.requires.rest and self.scene.inlet is None
+
+    @property
+    def pairs_once(self) -> bool:
+        """Whether a graph holds one direction of a pair, from the grain of the lower number; else both."""
+        return self.config.network == "impulse"
 
     @property
     def halo_m(self) -> float:
@@ -295,7 +297,7 @@ class Simulator(nn.Module):
         if self.requires.free_grains:
             free_pos = self.integrator.without_contact(state).pos
             graph = among(graph, can_touch(state, free_pos, graph, self.scene.frame_dt_s))
-        if self.config.network == "impulse":  # of a pair one direction
+        if self.pairs_once:
             edges = graph.grain_edges
             graph = replace(graph, grain_edges=edges[:, edges[0] < edges[1]])
         return graph

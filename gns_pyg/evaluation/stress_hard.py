@@ -350,7 +350,7 @@ def a_million(bench: Bench) -> Verdict:
     before_mb = peak_memory_mb()
     simulator.execution = replace(simulator.execution, tile_grains=100_000)
     after = last(simulator, crowd, 1)
-    n_edges, fewest = simulator.edges_done, 2.5 * side**3  # three pairs a grain, each once or twice
+    n_edges, fewest = simulator.edges_done, 5 * side**3 / (1 + simulator.pairs_once)  # six neighbours a grain
     return finite(after) and len(after.pos) == side**3 and n_edges > fewest, (
         f"{side**3:,} grains, {n_edges:,} edges through the networks: finite; peak memory "
         f"{peak_memory_mb() / 1024:.2f} GiB (before: {before_mb / 1024:.2f})"

@@ -8,7 +8,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from gns_pyg.graph.features import dot
+from gns_pyg.graph.features import between, closeness, dot, polar, surface_slip
 from gns_pyg.state import Contacts, Graph, State, Walls, fine
 
 N_SCALARS, N_WALL_SCALARS = 11, 13
@@ -39,14 +39,10 @@ def grain_contacts(
         dtype: the networks'.
     """
     sender, receiver = graph.grain_edges
-    rel_pos, rel_vel = (x.index_select(0, sender) - x.index_select(0, receiver) for x in (state.pos, free_vel))
+    rel_pos, rel_vel = (between(x, sender, receiver) for x in (state.pos, free_vel))
     touch = state.radius[sender] + state.radius[receiver]
-    radius, distance = touch / 2, torch.linalg.vector_norm(rel_pos, dim=1)
-    normal = rel_pos / torch.maximum(distance, 1e-3 * touch)[:, None]
-    slip = rel_vel
-    if state.ang_vel is not None:
-        arm = state.radius[:, None] * state.ang_vel
-        slip = rel_vel - torch.linalg.cross(arm.index_select(0, sender) + arm.index_select(0, receiver), normal)
+    radius, (distance, normal) = touch / 2, polar(rel_pos, touch)
+    slip = surface_slip(state, rel_vel, normal, sender, receiver)
     ahead = torch.linalg.vector_norm(rel_pos + rel_vel * dt_s, dim=1)
     scalars, sideways = _scalars(distance, distance - touch, ahead - touch, slip, normal, radius, velocity_m_s, dt_s)
     share = None
@@ -82,17 +78,14 @@ def wall_contacts(
     normal, wall_vel = -walls.normal.index_select(0, point), walls.vel.index_select(0, point)
     rel_pos = walls.pos.index_select(0, point) - state.pos.index_select(0, grain)
     radius, rel_vel = state.radius[grain], wall_vel - free_vel.index_select(0, grain)
-    distance, height = torch.linalg.vector_norm(rel_pos, dim=1), dot(rel_pos, normal)
-    slip = rel_vel
-    if state.ang_vel is not None:
-        slip = rel_vel - torch.linalg.cross((state.radius[:, None] * state.ang_vel).index_select(0, grain), normal)
+    (distance, towards), height = polar(rel_pos, radius), dot(rel_pos, normal)
+    slip = surface_slip(state, rel_vel, normal, grain)
     ahead = height + dot(rel_vel, normal) * dt_s
     scalars, sideways = _scalars(distance, height - radius, ahead - radius, slip, normal, radius, velocity_m_s, dt_s)
     aside = torch.linalg.vector_norm(rel_pos - height[:, None] * normal, dim=1, keepdim=True) / radius[:, None]
     columns = [scalars, aside, aside.square()]
     if friction:
         columns.append(walls.friction_angle[point][:, None])
-    towards = rel_pos / torch.maximum(distance, 1e-3 * radius)[:, None]
     moving = torch.cat([(wall_vel / velocity_m_s)[:, :, None], rel_pos.new_zeros(len(point), 3, channels - 1)], dim=2)
     basis = torch.stack([normal, sideways, towards], dim=2)
     return Contacts(graph.wall_edges, torch.cat(columns, dim=1).to(dtype), basis.to(dtype), slow, moving.to(dtype))
@@ -112,10 +105,10 @@ def _scalars(
     approach = dot(slip, normal)
     tangential = slip - approach[:, None] * normal
     speed = torch.linalg.vector_norm(tangential, dim=1)
-    near = radius / torch.maximum(distance, 0.1 * radius)
+    near = closeness(distance, radius)
     gap, ahead = gap / radius, ahead / radius
     slow_m_s = FINE * radius / dt_s
-    finely = [fine(gap, FINE), fine(ahead, FINE), *(fine(v / slow_m_s, 1.0) for v in (approach, speed))]
+    finely = [fine(gap, FINE), fine(ahead, FINE), fine(approach, slow_m_s), fine(speed, slow_m_s)]
     columns = [distance / radius, near, near**2, gap, ahead, approach / velocity_m_s, speed / velocity_m_s, *finely]
     sideways = tangential / (speed.square() + slow_m_s.square()).sqrt()[:, None]
     return torch.stack(columns, dim=1), sideways

@@ -7,7 +7,7 @@ the distance; `contact` adds what a contact law would ask for: gap, approach, sl
 """
 
 import torch
-from jaxtyping import Float
+from jaxtyping import Float, Int
 from torch import Tensor
 
 from gns_pyg.state import Graph, State, Walls
@@ -21,18 +21,14 @@ def grain_edges(
 ) -> Float[Tensor, "n_grain_edges f"]:
     """Features of grain-grain edges; `rel_pos` points from receiver to sender."""
     sender, receiver = graph.grain_edges
-    rel_pos = _between(state.pos, sender, receiver)
+    rel_pos = between(state.pos, sender, receiver)
     touch = state.radius[sender] + state.radius[receiver]
     radius = touch / 2
-    distance, direction = _polar(rel_pos, radius)
+    distance, direction = polar(rel_pos, radius)
     features = _geometry(rel_pos, distance, direction, radius)
     if contact:
-        rel_vel = _between(state.vel, sender, receiver)
-        slip = rel_vel
-        if state.ang_vel is not None:  # surface velocities at the contact: v + w x arm, arms of opposite sign
-            arm = state.radius[:, None] * state.ang_vel
-            turning = arm.index_select(0, sender) + arm.index_select(0, receiver)
-            slip = rel_vel - torch.linalg.cross(turning, direction)
+        rel_vel = between(state.vel, sender, receiver)
+        slip = surface_slip(state, rel_vel, direction, sender, receiver)
         ahead = torch.linalg.vector_norm(rel_pos + rel_vel * dt_s, dim=1)
         features += _contact(distance - touch, ahead - touch, rel_vel, slip, direction, radius, velocity_m_s)
     return torch.cat(features, dim=1).to(dtype)
@@ -45,15 +41,12 @@ def wall_edges(
     point, grain = graph.wall_edges
     rel_pos = walls.pos.index_select(0, point) - state.pos.index_select(0, grain)
     radius, normal = state.radius[grain], walls.normal.index_select(0, point)
-    distance, direction = _polar(rel_pos, radius)
+    distance, direction = polar(rel_pos, radius)
     height = -dot(rel_pos, normal)
     features = [*_geometry(rel_pos, distance, direction, radius), (height / radius)[:, None]]
     if contact:
         rel_vel = walls.vel.index_select(0, point) - state.vel.index_select(0, grain)
-        slip = rel_vel
-        if state.ang_vel is not None:
-            arm = state.radius[:, None] * state.ang_vel
-            slip = rel_vel + torch.linalg.cross(arm.index_select(0, grain), normal)
+        slip = surface_slip(state, rel_vel, -normal, grain)
         ahead = height - dot(rel_vel, normal) * dt_s
         features += _contact(height - radius, ahead - radius, rel_vel, slip, -normal, radius, velocity_m_s)
     return torch.cat(features, dim=1).to(dtype)
@@ -65,7 +58,8 @@ def dot(a: Float[Tensor, "n 3"], b: Float[Tensor, "n 3"]) -> Float[Tensor, " n"]
     return x + y + z
 
 
-def _between(values: Tensor, sender: Tensor, receiver: Tensor) -> Tensor:
+def between(values: Tensor, sender: Tensor, receiver: Tensor) -> Tensor:
+    """What the sender has more than the receiver, row by row."""
     return values.index_select(0, sender) - values.index_select(0, receiver)
 
 
@@ -77,14 +71,41 @@ def n_wall_edge_features(contact: bool) -> int:
     return N_GEOMETRY + 1 + contact * N_CONTACT
 
 
-def _polar(rel_pos: Tensor, radius: Tensor) -> tuple[Tensor, Tensor]:
+def polar(rel_pos: Tensor, radius: Tensor) -> tuple[Tensor, Tensor]:
     """Distance and direction; the direction of coincident points is zero, and its gradient stays bounded."""
     distance = torch.linalg.vector_norm(rel_pos, dim=1)
     return distance, rel_pos / torch.maximum(distance, 1e-3 * radius)[:, None]
 
 
+def surface_slip(
+    state: State,
+    rel_vel: Float[Tensor, "n 3"],
+    direction: Float[Tensor, "n 3"],
+    *ends: Int[Tensor, " n"],
+) -> Float[Tensor, "n 3"]:
+    """How the two surfaces of a contact move against each other, m/s: `rel_vel` and the spin of the grains at its ends,
+    v + w x arm, arms of opposite sign; where the state holds no spin, `rel_vel`.
+
+    Args:
+        state: grains.
+        rel_vel: of sender and receiver, m/s.
+        direction: from receiver to sender.
+        ends: the grains.
+    """
+    if state.ang_vel is None:
+        return rel_vel
+    arm = state.radius[:, None] * state.ang_vel
+    turning = sum((arm.index_select(0, end) for end in ends[1:]), arm.index_select(0, ends[0]))
+    return rel_vel - torch.linalg.cross(turning, direction)
+
+
+def closeness(distance: Float[Tensor, " n"], radius: Float[Tensor, " n"]) -> Float[Tensor, " n"]:
+    """Radius over distance, at most 10."""
+    return radius / torch.maximum(distance, 0.1 * radius)
+
+
 def _geometry(rel_pos: Tensor, distance: Tensor, direction: Tensor, radius: Tensor) -> list[Tensor]:
-    near = radius / torch.maximum(distance, 0.1 * radius)
+    near = closeness(distance, radius)
     scalars = torch.stack([distance / radius, near, near**2], dim=1)
     return [rel_pos / radius[:, None], direction, scalars]
 

@@ -6,6 +6,7 @@ from torch import Tensor, nn
 
 from gns_pyg.models.interaction import Interaction
 from gns_pyg.models.mlp import blocks, mlp, recurring
+from gns_pyg.state import reached
 
 NODES, EDGES = 128, 512  # rows come in multiples of them
 
@@ -61,22 +62,19 @@ class ContactNetwork(nn.Module):
         (edges come in both directions), so that grains without an edge can be left out of the computation.
         """
         n_receivers, sparse = len(receiver_features), self.sparse and edge_index.device.type == "cpu"
-        reached = torch.zeros(n_receivers, dtype=torch.bool, device=edge_index.device).index_fill(
-            0, edge_index[1], True
-        )
         sender, receiver = edge_index
+        hears = reached(n_receivers, receiver)
         if sparse:
-            grains, receiver = _compact(reached, receiver)
+            grains, receiver = _compact(hears, receiver)
             receiver_features = receiver_features[grains]
         n_reached = len(receiver_features)
         receivers = self.encode_receiver(recurring(receiver_features, NODES))
         if self.encode_sender is None or sender_features is None:
             senders = None
-            sender = _compact(reached, sender)[1] if sparse else sender
+            sender = _compact(hears, sender)[1] if sparse else sender
         else:
             if sparse:
-                sending = torch.zeros(len(sender_features), dtype=torch.bool).index_fill(0, sender, True)
-                points, sender = _compact(sending, sender)
+                points, sender = _compact(reached(len(sender_features), sender), sender)
                 sender_features = sender_features[points]
             senders = self.encode_sender(recurring(sender_features, NODES))
         sender, receiver = recurring(sender, EDGES), recurring(receiver, EDGES, value=len(receivers) - 1)
@@ -87,7 +85,7 @@ class ContactNetwork(nn.Module):
         effect = self.decode(receivers)[:n_reached]
         if sparse:
             return effect.new_zeros(n_receivers, self.n_out).index_copy(0, grains, effect)
-        return torch.where(reached[:, None], effect, 0.0)
+        return torch.where(hears[:, None], effect, 0.0)
 
 
 def _compact(chosen: Bool[Tensor, " n"], index: Int[Tensor, " e"]) -> tuple[Int[Tensor, " m"], Int[Tensor, " e"]]:

@@ -11,12 +11,12 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import torch
-from jaxtyping import Float
+from jaxtyping import Bool, Float
 from torch import Tensor, nn
 from torch_geometric.nn import MessagePassing
 
 from gns_pyg.models.mlp import blocks, linear, mlp, recurring
-from gns_pyg.state import Contacts, fine
+from gns_pyg.state import Contacts, fine, reached
 
 ROWS = 128  # of which contacts come in multiples, as in `contact_network`
 VELOCITY, MEAN, GAINED = 0, 1, 2  # channels: end velocity, mean velocity's correction, what gravity adds in a frame
@@ -55,15 +55,24 @@ class ImpulseNetwork(nn.Module):
         self, *, n_scalar: int, n_basis: int, mutual: bool, hidden: int, layers: int, mlp_layers: int, channels: int
     ) -> None:
         super().__init__()
-        self.hidden = hidden
+        self.hidden, self.mutual = hidden, mutual
         self.encode = mlp(n_scalar, hidden, hidden, mlp_layers, layer_norm=True)
         self.rounds = nn.ModuleList(
             ImpulseRound(hidden, mlp_layers, channels, n_basis, mutual=mutual, last=turn == layers - 1)
             for turn in range(layers)
         )
 
+    def hears(self, n: int, contacts: Contacts) -> Bool[Tensor, " n"]:
+        """Which of `n` grains have a contact of this kind."""
+        return reached(n, *contacts.ends[0 if self.mutual else 1 :])
+
     def forward(
-        self, turn: int, grains: Grains, contacts: Sequence[Contacts], edges: Sequence[Tensor] | None
+        self,
+        turn: int,
+        grains: Grains,
+        contacts: Sequence[Contacts],
+        edges: Sequence[Tensor] | None,
+        hears: Bool[Tensor, " n"],
     ) -> tuple[Grains, list[Tensor]]:
         """One round: what grains carry after it, and the contacts' latents.
 
@@ -72,10 +81,11 @@ class ImpulseNetwork(nn.Module):
             grains: before it.
             contacts: in pieces.
             edges: their latents after the round before, None in the first.
+            hears: grains that have a contact of this kind.
         """
         if edges is None:
             edges = [self.encode(piece.scalars) for piece in contacts]
-        return self.rounds[turn](grains, contacts, edges)
+        return self.rounds[turn](grains, contacts, edges, hears)
 
 
 class ImpulseRound(MessagePassing):
@@ -103,7 +113,7 @@ class ImpulseRound(MessagePassing):
         self.update_mlp = None if last else mlp(2 * hidden, hidden, hidden, mlp_layers, layer_norm=True)
 
     def forward(
-        self, grains: Grains, contacts: Sequence[Contacts], edges: Sequence[Tensor]
+        self, grains: Grains, contacts: Sequence[Contacts], edges: Sequence[Tensor], hears: Bool[Tensor, " n"]
     ) -> tuple[Grains, list[Tensor]]:
         n, carried = len(grains.latent), torch.cat([grains.vel, grains.spin], dim=2)
         latent, after = linear(self.from_ends, grains.latent), []
@@ -129,10 +139,6 @@ class ImpulseRound(MessagePassing):
         vel, spin = (part.view(grains.vel.shape) for part in gained[:, heard:].chunk(2, dim=1))
         there = grains.latent
         if self.update_mlp is not None:  # of those that hear: a network that reaches nobody changes nothing
-            hears = torch.zeros(n, dtype=torch.bool, device=there.device)
-            for piece in contacts:
-                for end in piece.ends[0 if self.mutual else 1 :, : piece.n]:
-                    hears.index_fill_(0, end, True)
             updated = there + self.update_mlp(torch.cat([there, gained[:, :heard]], dim=1))
             there = torch.where(hears[:, None], updated, there)
         return Grains(there, grains.vel + vel, grains.spin + spin), after
@@ -210,8 +216,9 @@ def pieces(contacts: Contacts, hidden: int) -> list[Contacts]:
 def exchange(grains: Grains, kinds: Sequence[tuple[ImpulseNetwork, Contacts]]) -> Grains:
     """What grains carry after all rounds, in which the kinds of contact take turns."""
     lots = [pieces(contacts, network.hidden) for network, contacts in kinds]
+    hears = [network.hears(len(grains.latent), contacts) for network, contacts in kinds]
     edges: list[list[Tensor] | None] = [None] * len(kinds)
     for turn in range(len(kinds[0][0].rounds)):
         for kind, (network, _) in enumerate(kinds):
-            grains, edges[kind] = network(turn, grains, lots[kind], edges[kind])
+            grains, edges[kind] = network(turn, grains, lots[kind], edges[kind], hears[kind])
     return grains

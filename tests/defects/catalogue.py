@@ -32,6 +32,7 @@ class Defect:
 
 
 FEATURES, NETWORK = "gns_pyg/graph/features.py", "gns_pyg/models/contact_network.py"
+IMPULSES = "gns_pyg/models/impulse_network.py"
 FLIGHT, INTEGRATOR = "gns_pyg/scene/free_flight.py", "gns_pyg/dynamics/integrator.py"
 SIMULATOR, BOUNDARY = "gns_pyg/dynamics/simulator.py", "gns_pyg/dynamics/boundary.py"
 TRAINING = "gns_pyg/training/module.py"
@@ -47,8 +48,8 @@ DEFECTS = [
     Defect(
         "epsilon dropped from the inverse distance",
         FEATURES,
-        "near = radius / torch.maximum(distance, 0.1 * radius)",
-        "near = radius / distance",
+        "return radius / torch.maximum(distance, 0.1 * radius)",
+        "return radius / distance",
         ("tests/dynamics/test_simulator.py::test_gradients_of_coincident_grains_are_finite",),
     ),
     Defect(
@@ -61,8 +62,8 @@ DEFECTS = [
     Defect(
         "edge direction swapped in the features",
         FEATURES,
-        "rel_pos = _between(state.pos, sender, receiver)",
-        "rel_pos = _between(state.pos, receiver, sender)",
+        "rel_pos = between(state.pos, sender, receiver)",
+        "rel_pos = between(state.pos, receiver, sender)",
         ("tests/graph/test_features.py::test_a_grain_sees_another_one_where_it_is_and_as_it_moves",),
     ),
     Defect(
@@ -264,9 +265,23 @@ DEFECTS = [
     Defect(
         "spins of two grains in contact subtracted, not added",
         FEATURES,
-        "turning = arm.index_select(0, sender) + arm.index_select(0, receiver)",
-        "turning = arm.index_select(0, sender) - arm.index_select(0, receiver)",
+        "turning = sum((arm.index_select(0, end) for end in ends[1:])",
+        "turning = sum((-arm.index_select(0, end) for end in ends[1:])",
         ("tests/graph/test_features.py::test_a_grain_sees_another_one_where_it_is_and_as_it_moves",),
+    ),
+    Defect(
+        "a contact's impulse given to both grains alike",
+        IMPULSES,
+        "[message[:, :heard], -impulse, turn]",
+        "[message[:, :heard], impulse, turn]",
+        ("tests/models/test_impulse_network.py::test_no_momentum_is_made_between_grains",),
+    ),
+    Defect(
+        "the sender of an impulse turned the other way",
+        IMPULSES,
+        "[message[:, :heard], -impulse, turn]",
+        "[message[:, :heard], -impulse, -turn]",
+        ("tests/models/test_impulse_network.py::test_a_tangential_impulse_turns_both_grains_alike",),
     ),
     Defect(
         "graphs of a batch see each other's walls",

@@ -6,10 +6,7 @@ import pytest
 import torch
 from scipy.spatial.transform import Rotation
 
-from gns_pyg.dynamics import simulator as steps
 from gns_pyg.errors import ConfigError
-from gns_pyg.models import impulse_network
-from gns_pyg.models.impulse_network import Grains
 from gns_pyg.state import Walls
 from tests import scenes
 from tests.simulators import IMPULSE, simulator, state_in_box
@@ -36,8 +33,7 @@ def test_no_momentum_is_made_between_grains(state):
         assert torch.allclose(given[start.batch == graph].sum(0), torch.zeros(given.shape[1]).double(), atol=1e-12)
 
 
-def test_unlike_masses_exchange_momentum_and_spin_by_their_inertia():
-    """The sum of m v is kept, and an impulse F turns both grains by r n x F over their own 2/5 m r^2."""
+def test_unlike_masses_keep_their_momentum():
     network, start = model(radii=(0.01, 0.014)), state_in_box([40])
     start = replace(start, radius=torch.tensor([0.01, 0.014]).double().repeat_interleave(20))
     vel = network.correction(start)[:, 3:6]
@@ -138,8 +134,6 @@ def test_rounds_see_what_earlier_rounds_have_changed():
         faster = replace(start, vel=start.vel + torch.tensor([[1.0, 0.0, 0.0], [0.0] * 3, [0.0] * 3]).double())
         moved = (network.correction(faster) - network.correction(start))[2].abs().max() > 1e-12
         assert bool(moved) == reached
-    assert isinstance(steps.exchange, type(impulse_network.exchange))
-    assert Grains.__dataclass_fields__.keys() == {"latent", "vel", "spin"}
 
 
 def with_shares(network, share):
