@@ -207,7 +207,7 @@ class Simulator(nn.Module):
         assert isinstance(self.grain_network, ImpulseNetwork)
         kinds = [(self.grain_network, contacts.grain_contacts(state, free_vel, graph, unlike=unlike, **options))]
         if isinstance(self.wall_network, ImpulseNetwork) and graph.walls is not None:
-            options |= dict(friction=self.requires.wall_friction, channels=self.config.channels)
+            options |= dict(friction=self.requires.wall_friction, moving=self.requires.wall_velocity)
             kinds.append((self.wall_network, contacts.wall_contacts(state, free_vel, graph, graph.walls, **options)))
         after = exchange(grains, kinds)
         vel, spin = after.vel - grains.vel, after.spin - grains.spin

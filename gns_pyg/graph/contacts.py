@@ -60,7 +60,7 @@ def wall_contacts(
     walls: Walls,
     *,
     friction: bool,
-    channels: int,
+    moving: bool,
     slow: float,
     velocity_m_s: float,
     dt_s: float,
@@ -71,7 +71,7 @@ def wall_contacts(
 
     Args:
         friction: the point's friction angle is a scalar too.
-        channels: vectors that a grain carries.
+        moving: walls move.
         The others: as of `grain_contacts`.
     """
     point, grain = graph.wall_edges
@@ -86,9 +86,9 @@ def wall_contacts(
     columns = [scalars, aside, aside.square()]
     if friction:
         columns.append(walls.friction_angle[point][:, None])
-    moving = torch.cat([(wall_vel / velocity_m_s)[:, :, None], rel_pos.new_zeros(len(point), 3, channels - 1)], dim=2)
-    basis = torch.stack([normal, sideways, towards], dim=2)
-    return Contacts(graph.wall_edges, torch.cat(columns, dim=1).to(dtype), basis.to(dtype), slow, moving.to(dtype))
+    basis, own_vel = torch.stack([normal, sideways, towards], dim=2), (wall_vel / velocity_m_s).to(dtype)
+    scalars = torch.cat(columns, dim=1).to(dtype)
+    return Contacts(graph.wall_edges, scalars, basis.to(dtype), slow, own_vel if moving else None)
 
 
 def _scalars(

@@ -5,10 +5,10 @@ from jaxtyping import Bool, Float, Int
 from torch import Tensor, nn
 
 from gns_pyg.models.interaction import Interaction
-from gns_pyg.models.mlp import blocks, mlp, recurring
+from gns_pyg.models.mlp import ROWS, blocks, mlp, recurring
 from gns_pyg.state import reached
 
-NODES, EDGES = 128, 512  # rows come in multiples of them
+EDGES = 512  # edges come in multiples of it
 
 
 class ContactNetwork(nn.Module):
@@ -68,7 +68,7 @@ class ContactNetwork(nn.Module):
             grains, receiver = _compact(hears, receiver)
             receiver_features = receiver_features[grains]
         n_reached = len(receiver_features)
-        receivers = self.encode_receiver(recurring(receiver_features, NODES))
+        receivers = self.encode_receiver(recurring(receiver_features, ROWS))
         if self.encode_sender is None or sender_features is None:
             senders = None
             sender = _compact(hears, sender)[1] if sparse else sender
@@ -76,7 +76,7 @@ class ContactNetwork(nn.Module):
             if sparse:
                 points, sender = _compact(reached(len(sender_features), sender), sender)
                 sender_features = sender_features[points]
-            senders = self.encode_sender(recurring(sender_features, NODES))
+            senders = self.encode_sender(recurring(sender_features, ROWS))
         sender, receiver = recurring(sender, EDGES), recurring(receiver, EDGES, value=len(receivers) - 1)
         edges = [self.encode_edge(block) for block in blocks(recurring(edge_features, EDGES), self.hidden)]
         ends = blocks(torch.stack([sender, receiver]), self.hidden, dim=1)

@@ -11,14 +11,13 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import torch
-from jaxtyping import Bool, Float
+from jaxtyping import Bool, Float, Int
 from torch import Tensor, nn
 from torch_geometric.nn import MessagePassing
 
-from gns_pyg.models.mlp import blocks, linear, mlp, recurring
+from gns_pyg.models.mlp import ROWS, blocks, linear, mlp, only, recurring
 from gns_pyg.state import Contacts, fine, reached
 
-ROWS = 128  # of which contacts come in multiples, as in `contact_network`
 VELOCITY, MEAN, GAINED = 0, 1, 2  # channels: end velocity, mean velocity's correction, what gravity adds in a frame
 SPHERE = 2.5  # m r^2 / I: what a tangential impulse turns it
 FASTEST = 30.0  # of the velocity scale: what answers a slip in proportion stays below; nothing grows without end
@@ -38,6 +37,27 @@ class Grains:
     latent: Float[Tensor, "n hidden"]
     vel: Float[Tensor, "n 3 channels"]
     spin: Float[Tensor, "n 3 channels"]
+
+
+@dataclass(frozen=True)
+class Piece:
+    """Contacts that are handled at once, in a number that comes again (see `models.mlp`). What has directions has the
+    contacts as its last dimension: the same component of all of them lies together in memory.
+
+    Attributes:
+        ends, scalars, slow, wall_vel: as of `Contacts`.
+        basis: the contacts' directions; first the normal.
+        told: who tells whom: every [sender, receiver], between grains then every [receiver, sender].
+        share: how much more it moves the one who is told than the other (see `Contacts`).
+    """
+
+    ends: Int[Tensor, "2 e"]
+    scalars: Float[Tensor, "e f"]
+    basis: Float[Tensor, "3 b e"]
+    slow: float
+    wall_vel: Float[Tensor, "e 3"] | None
+    told: Int[Tensor, "2 m"]
+    share: Float[Tensor, "m 1"] | None
 
 
 class ImpulseNetwork(nn.Module):
@@ -70,7 +90,7 @@ class ImpulseNetwork(nn.Module):
         self,
         turn: int,
         grains: Grains,
-        contacts: Sequence[Contacts],
+        contacts: Sequence[Piece],
         edges: Sequence[Tensor] | None,
         hears: Bool[Tensor, " n"],
     ) -> tuple[Grains, list[Tensor]]:
@@ -79,7 +99,7 @@ class ImpulseNetwork(nn.Module):
         Args:
             turn: number of the round.
             grains: before it.
-            contacts: in pieces.
+            contacts: of this kind.
             edges: their latents after the round before, None in the first.
             hears: grains that have a contact of this kind.
         """
@@ -113,63 +133,56 @@ class ImpulseRound(MessagePassing):
         self.update_mlp = None if last else mlp(2 * hidden, hidden, hidden, mlp_layers, layer_norm=True)
 
     def forward(
-        self, grains: Grains, contacts: Sequence[Contacts], edges: Sequence[Tensor], hears: Bool[Tensor, " n"]
+        self, grains: Grains, contacts: Sequence[Piece], edges: Sequence[Tensor], hears: Bool[Tensor, " n"]
     ) -> tuple[Grains, list[Tensor]]:
-        n, carried = len(grains.latent), torch.cat([grains.vel, grains.spin], dim=2)
-        latent, after = linear(self.from_ends, grains.latent), []
-        heard = 0 if self.update_mlp is None else self.hidden
-        gained = carried.new_zeros(n, heard + 6 * self.channels)
+        n, heard, third = len(grains.latent), 0 if self.update_mlp is None else self.hidden, 3 * self.channels
+        motion = torch.cat([grains.vel.flatten(1), grains.spin.flatten(1)], dim=1)
+        sign = motion.new_ones(heard + 2 * third)
+        sign[heard : heard + third] = -1  # the sender's impulse; what it hears and how it turns are the receiver's
+        latent, reflected, after = linear(self.from_ends, grains.latent), motion * sign[heard:], []
+        gained = motion.new_zeros(n, len(sign))
         for piece, before in zip(contacts, edges, strict=True):
-            edge, *told = self.edge_update(piece, before, latent, carried)
-            message, impulse, turn = (part[: piece.n].flatten(1) for part in told)
-            to, share = piece.ends[:, : piece.n], None if piece.share is None else piece.share[: piece.n]
-            rows = torch.cat([message[:, :heard], impulse, turn], dim=1)
-            if share is not None:
-                rows[:, heard:] *= share[:, 1:]
+            edge, message, change = self.edge_update(piece, before, latent, motion, reflected)
+            rows = torch.cat([message[:, :heard], change], dim=1).to(gained.dtype)
+            rows = rows[: piece.told.shape[1] // (1 + self.mutual)]
             if self.mutual:
-                back = torch.cat([message[:, :heard], -impulse, turn], dim=1)
-                if share is not None:
-                    back[:, heard:] *= share[:, :1]
-                to, rows = torch.cat([to, to.flip(0)], dim=1), torch.cat([rows, back])
+                rows = torch.cat([rows, rows * sign])
+            if piece.share is not None:
+                rows = torch.cat([rows[:, :heard], rows[:, heard:] * piece.share], dim=1)
             if len(contacts) == 1:
-                gained = self.propagate(to, rows=rows.to(gained.dtype), size=(n, n))
+                gained = self.propagate(piece.told, rows=rows, size=(n, n))
             else:
-                gained.index_add_(0, to[1], rows.to(gained.dtype))  # sums stay in full precision
+                gained.index_add_(0, piece.told[1], rows)  # sums stay in full precision
             after.append(edge)
         vel, spin = (part.view(grains.vel.shape) for part in gained[:, heard:].chunk(2, dim=1))
         there = grains.latent
         if self.update_mlp is not None:  # of those that hear: a network that reaches nobody changes nothing
-            updated = there + self.update_mlp(torch.cat([there, gained[:, :heard]], dim=1))
-            there = torch.where(hears[:, None], updated, there)
+            there = there + only(hears, self.update_mlp, torch.cat([there, gained[:, :heard]], dim=1))
         return Grains(there, grains.vel + vel, grains.spin + spin), after
 
     def edge_update(
-        self, contacts: Contacts, edge: Tensor, latent: Tensor, carried: Tensor
-    ) -> tuple[Tensor, Tensor, Tensor, Tensor]:
-        """What every contact knows after this round, says to its grains, and gives the receiver: an impulse and a turn,
-        (n_contacts, 3, channels) each."""
+        self, contacts: Piece, edge: Tensor, latent: Tensor, motion: Tensor, reflected: Tensor
+    ) -> tuple[Tensor, Tensor, Tensor]:
+        """What every contact knows after this round, says to its grains, and gives the receiver: impulse and turn in
+        every channel, (n_contacts, 6 channels)."""
         (sender, receiver), basis = contacts.ends, contacts.basis
-        normal, n_basis = basis[:, :, :1], basis.shape[2]
-        vel, spin = carried.index_select(0, receiver).chunk(2, dim=2)
-        hidden = latent.index_select(0, receiver)
+        hidden, moving = latent.index_select(0, receiver), reflected.index_select(0, receiver)
         if self.mutual:
-            other_vel, other_spin = carried.index_select(0, sender).chunk(2, dim=2)
-            spin, hidden = spin + other_spin, hidden + latent.index_select(0, sender)
-        else:
-            assert contacts.wall_vel is not None
-            other_vel = contacts.wall_vel
-        slip = other_vel - vel - torch.linalg.cross(spin, normal.expand_as(spin), dim=1)  # of the surfaces in touch
-        along = (basis[:, :, :, None] * slip[:, :, None, :]).sum(1)
-        speed = (slip.square().sum(1) + SOFT).sqrt()
-        seen = torch.cat([along.flatten(1), speed], dim=1)
-        seen = torch.cat([seen, fine(seen, contacts.slow)], dim=1)
+            hidden, moving = hidden + latent.index_select(0, sender), moving + motion.index_select(0, sender)
+        rel_vel, spin = moving.t().contiguous().view(2, 3, self.channels, -1)
+        if contacts.wall_vel is not None:
+            rel_vel = torch.cat([rel_vel[:, :1] + contacts.wall_vel.t()[:, None], rel_vel[:, 1:]], dim=1)
+        slip = rel_vel - cross(spin, basis[:, :1])  # of the surfaces in touch
+        along = (basis[:, :, None] * slip[:, None]).sum(0).flatten(0, 1)
+        speed = (slip.square().sum(0) + SOFT).sqrt()
+        seen = torch.cat([along, speed, fine(along, contacts.slow), fine(speed, contacts.slow)]).t().contiguous()
         message = self.message_mlp((hidden + linear(self.from_edge, edge) + linear(self.from_seen, seen)).relu_())
         edge = edge + message
-        factors = self.impulse_mlp(edge).view(len(edge), n_basis + 1, self.channels)
-        against = factors[:, -1] / (1 + (speed / FASTEST).square()).sqrt()
-        impulse = (basis[:, :, :, None] * factors[:, None, :-1]).sum(2) + against[:, None] * slip
-        turn = SPHERE * torch.linalg.cross(normal.expand_as(impulse), impulse, dim=1)
-        return edge, message, impulse, turn
+        factors = self.impulse_mlp(edge).t().contiguous().view(basis.shape[1] + 1, self.channels, len(edge))
+        against = factors[-1] / (1 + (speed / FASTEST).square()).sqrt()
+        impulse = (basis[:, :, None] * factors[:-1]).sum(1) + against * slip
+        change = torch.cat([impulse, -SPHERE * cross(impulse, basis[:, :1])])
+        return edge, message, change.flatten(0, 1).t().contiguous()
 
     def message(self, rows: Tensor) -> Tensor:
         return rows
@@ -200,22 +213,35 @@ class Damping(nn.Module):
         return self.shares(torch.cat([after.latent, fine(torch.cat(lengths, dim=1), slow)], dim=1)).sigmoid()
 
 
-def pieces(contacts: Contacts, hidden: int) -> list[Contacts]:
-    """Contacts as pieces that are best handled one after the other, in numbers that come again (see `models.mlp`)."""
+def pieces(contacts: Contacts, hidden: int, *, mutual: bool) -> list[Piece]:
+    """Contacts as pieces that are best handled one after the other."""
     always = [blocks(side, hidden) for side in (contacts.ends.T, contacts.scalars, contacts.basis)]
-    perhaps = [None if side is None else blocks(side, hidden) for side in (contacts.wall_vel, contacts.share)]
+    none = [None] * len(always[0])
+    perhaps = [none if side is None else blocks(side, hidden) for side in (contacts.wall_vel, contacts.share)]
     found = []
-    for number, (ends, scalars, basis) in enumerate(zip(*always, strict=True)):
-        wall_vel, share = (None if lot is None else recurring(lot[number], ROWS) for lot in perhaps)
-        ends, n = recurring(ends, ROWS).T, len(ends)
-        filled = recurring(scalars, ROWS), recurring(basis, ROWS)
-        found.append(Contacts(ends, *filled, contacts.slow, wall_vel, share, n))
+    for ends, scalars, basis, wall_vel, share in zip(*always, *perhaps, strict=True):
+        found.append(
+            Piece(
+                ends=recurring(ends, ROWS).T,
+                scalars=recurring(scalars, ROWS),
+                basis=recurring(basis, ROWS).permute(1, 2, 0).contiguous(),
+                slow=contacts.slow,
+                wall_vel=None if wall_vel is None else recurring(wall_vel, ROWS),
+                told=(torch.cat([ends, ends.flip(1)]) if mutual else ends).T,
+                share=None if share is None else share.flip(1).T.reshape(-1, 1),
+            )
+        )
     return found
+
+
+def cross(a: Float[Tensor, "3 channels e"], b: Float[Tensor, "3 1 e"]) -> Float[Tensor, "3 channels e"]:
+    """a x b; torch.linalg.cross takes several times as long on a CPU."""
+    return a.roll(-1, 0) * b.roll(1, 0) - a.roll(1, 0) * b.roll(-1, 0)
 
 
 def exchange(grains: Grains, kinds: Sequence[tuple[ImpulseNetwork, Contacts]]) -> Grains:
     """What grains carry after all rounds, in which the kinds of contact take turns."""
-    lots = [pieces(contacts, network.hidden) for network, contacts in kinds]
+    lots = [pieces(contacts, network.hidden, mutual=network.mutual) for network, contacts in kinds]
     hears = [network.hears(len(grains.latent), contacts) for network, contacts in kinds]
     edges: list[list[Tensor] | None] = [None] * len(kinds)
     for turn in range(len(kinds[0][0].rounds)):

@@ -1,10 +1,12 @@
 """The one kind of small network everything else is made of."""
 
 import itertools
+from collections.abc import Callable
 
 import torch
 from torch import Tensor, nn
 
+ROWS = 128  # of which rows come in multiples (see `recurring`)
 BLOCK = 2**18  # numbers of a latent that a CPU handles at once: few enough to stay in its cache through all layers
 
 ONE_DNN = torch.backends.mkldnn.is_available() and hasattr(torch.ops.mkldnn, "_linear_pointwise")
@@ -49,6 +51,16 @@ def linear(layer: nn.Linear, rows: Tensor, *, relu: bool = False) -> Tensor:
     else:
         rows = layer(rows)
     return rows.relu_() if relu else rows
+
+
+def only(chosen: Tensor, function: Callable[[Tensor], Tensor], rows: Tensor) -> Tensor:
+    """`function(rows)` where `chosen`, (n,), else 0. A CPU computes no others; on a GPU numbers of rows stay as they
+    are."""
+    if rows.device.type != "cpu":
+        return torch.where(chosen[:, None], function(rows), 0.0)
+    named = chosen.nonzero().flatten()
+    done = function(recurring(rows.index_select(0, named), ROWS))[: len(named)]
+    return done.new_zeros(len(rows), done.shape[1]).index_copy(0, named, done)
 
 
 def blocks(rows: Tensor, width: int, dim: int = 0) -> tuple[Tensor, ...]:

@@ -3,9 +3,9 @@
 import pytest
 import torch
 
-from gns_pyg.models.contact_network import EDGES, NODES, ContactNetwork
+from gns_pyg.models.contact_network import EDGES, ContactNetwork
 from gns_pyg.models.interaction import Interaction
-from gns_pyg.models.mlp import linear
+from gns_pyg.models.mlp import ROWS, linear
 
 WIDTH = 8
 
@@ -108,7 +108,7 @@ def test_without_gradients_layers_see_the_same_numbers_of_rows_at_every_step(n_s
                 patch.setattr(f"gns_pyg.models.{module}.linear", spied)
             found = model(senders, grains, edges, edge_index)
         assert torch.allclose(found, expected, rtol=1e-5, atol=1e-5 * float(expected.abs().max()))
-    assert seen <= {NODES, 2 * NODES, 3 * NODES, EDGES, 4 * EDGES}
+    assert seen <= {ROWS, 2 * ROWS, 3 * ROWS, EDGES, 4 * EDGES}
 
 
 @pytest.mark.parametrize("n_sender", [None, 4])
