@@ -272,15 +272,15 @@ DEFECTS = [
     Defect(
         "a contact's impulse given to both grains alike",
         IMPULSES,
-        "[message[:, :heard], -impulse, turn]",
-        "[message[:, :heard], impulse, turn]",
+        "torch.cat([rows, rows * sign])",
+        "torch.cat([rows, rows])",
         ("tests/models/test_impulse_network.py::test_no_momentum_is_made_between_grains",),
     ),
     Defect(
         "the sender of an impulse turned the other way",
         IMPULSES,
-        "[message[:, :heard], -impulse, turn]",
-        "[message[:, :heard], -impulse, -turn]",
+        "torch.cat([rows, rows * sign])",
+        "torch.cat([rows, torch.cat([rows[:, :heard], -rows[:, heard:]], dim=1)])",
         ("tests/models/test_impulse_network.py::test_a_tangential_impulse_turns_both_grains_alike",),
     ),
     Defect(
