@@ -26,6 +26,8 @@ class TrainingConfig:
             does not grow with the scene; null looks at all.
         loss_knee: where the loss turns from the square of a scaled error (of mean velocity, end velocity, spin) to its
             length; 0 is the mean square throughout (the paper).
+        balance: weight of the momentum and the energy that cells of some 30 grains wrongly gain or lose together. (Each
+            grain's own error is smallest for an average motion, which loses speed at every step.) 0 leaves it out.
         start_from: a bundle whose weights and scales training starts from; null draws and measures them.
         average_decay: the weights' exponential moving average with this decay is what is judged and saved; 0 is none.
     """
@@ -41,6 +43,7 @@ class TrainingConfig:
     unroll_from: float = MISSING
     gradient_clip: float = MISSING
     loss_knee: float = MISSING
+    balance: float = MISSING
     start_from: str | None = None
     region_grains: int | None = None
     average_decay: float = MISSING
@@ -57,6 +60,7 @@ class TrainingConfig:
             "unroll_from",
             "gradient_clip",
             "loss_knee",
+            "balance",
         )
         for key in ("seed", *at_least_0):
             value = getattr(self, key)

@@ -7,10 +7,8 @@ from typing import Any, cast
 import numpy as np
 import pytorch_lightning as pl
 import torch
-from jaxtyping import Float
 from pytorch_lightning.utilities.types import OptimizerLRScheduler
 from torch import Tensor
-from torch import distributed as dist
 from torch.optim.swa_utils import AveragedModel, get_ema_multi_avg_fn
 
 from gns_pyg.dynamics.simulator import Simulator
@@ -21,6 +19,7 @@ from gns_pyg.state import State, Window
 from gns_pyg.training.augment import transform
 from gns_pyg.training.checkpoint import REMEDY
 from gns_pyg.training.config import TrainingConfig
+from gns_pyg.training.loss import CELL_RADII, balance_loss, cells, mean_loss, share_of_mean
 
 MOST = 1e15  # of any number in a checkpoint beside its tensors
 
@@ -29,9 +28,10 @@ class TrainingModule(pl.LightningModule):
     """One-step training, on perturbed frames and on the simulator's own steps.
 
     The loss is the mean square of the scaled correction's error: for position-only states the paper's (12) up to a
-    constant factor; or, with `loss_knee`, its mean length, which a few violent contacts do not rule. Noise and
-    unrolling are drawn from the seed, the update's number and the window's place in its batch, so a resumed run repeats
-    none and skips none, and several processes that share a batch compute what one would.
+    constant factor; or, with `loss_knee`, its mean length, which a few violent contacts do not rule. `balance` adds
+    what grains wrongly gain or lose together. Noise and unrolling are drawn from the seed, the update's number and the
+    window's place in its batch, so a resumed run repeats none and skips none, and several processes that share a batch
+    compute what one would.
 
     Args:
         simulator: what is trained.
@@ -147,7 +147,10 @@ class TrainingModule(pl.LightningModule):
             counted = (counted & torch.zeros_like(counted).index_fill(0, core, True))[region]
             state, following = state.pick(region), following.pick(region)
         error = (self.simulator.correction(state) - self.simulator.target(state, following))[counted]
-        loss = mean_loss(error, self.config.loss_knee) * share_of_mean(len(error), error.device)
+        loss = mean_loss(error, self.config.loss_knee)
+        if self.config.balance:
+            loss = loss + self.config.balance * self._imbalance(error, state, following, counted, randoms)
+        loss = loss * share_of_mean(len(error), error.device)
         if not torch.isfinite(loss):
             raise NumericalError(
                 f"training update {self.global_step}",
@@ -157,6 +160,16 @@ class TrainingModule(pl.LightningModule):
             )
         self.log("train/loss", loss, batch_size=state.n_graphs, sync_dist=True)
         return loss
+
+    def _imbalance(
+        self, error: Tensor, state: State, following: State, counted: Tensor, randoms: Sequence[torch.Generator]
+    ) -> Tensor:
+        """`balance_loss` of the `counted` grains, velocities over the data's scale."""
+        simulator, (pos, batch, vel) = self.simulator, (x[counted] for x in (state.pos, state.batch, following.vel))
+        velocity_m_s, size_m = simulator.statistics.velocity_m_s, CELL_RADII * max(simulator.scene.grains.radii_m)
+        end = slice(3, 6) if simulator.integrator.n_groups > 1 else slice(3)  # with differences mean and end are one
+        error = error[:, end] * simulator.scale[end] / velocity_m_s
+        return balance_loss(error, (vel / velocity_m_s).to(error.dtype), cells(pos, batch, size_m, randoms))
 
     def _random(self, *window: int) -> torch.Generator:
         """A generator for this update, or for one window of its batch, whichever process computes it."""
@@ -196,25 +209,6 @@ def unlike(found: Any, expected: Any, where: str) -> tuple[str, str] | None:
     if isinstance(expected, int | float) and not 0 <= found <= MOST:
         return f"{where}: {found!r:.60}", f"0 to {MOST:g}"
     return None
-
-
-def mean_loss(error: Float[Tensor, "n d"], knee: float) -> Float[Tensor, ""]:
-    """Mean square of `error`, or, with a knee, the mean of sqrt(|e|^2 + knee^2) - knee over its groups e of three (the
-    pseudo-Huber loss, Charbonnier et al. 1997); 0 where there is none."""
-    if not knee:
-        return error.square().sum() / max(error.numel(), 1)
-    squares = error.view(len(error), error.shape[1] // 3, 3).square().sum(2)
-    return ((squares + knee**2).sqrt() - knee).sum() / max(squares.numel(), 1)
-
-
-def share_of_mean(rows: int, device: torch.device) -> float:
-    """What a process's mean over `rows` must be multiplied by, so that the mean over processes, which is what their
-    gradients are, is the mean over the rows of all: rows / (mean rows of a process)."""
-    if not dist.is_initialized() or dist.get_world_size() == 1:
-        return 1.0
-    total = torch.tensor(float(rows), device=device)
-    dist.all_reduce(total)
-    return rows * dist.get_world_size() / max(float(total), 1.0)
 
 
 def perturb(state: State, config: TrainingConfig, simulator: Simulator, randoms: Sequence[torch.Generator]) -> State:

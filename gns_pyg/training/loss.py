@@ -1,0 +1,60 @@
+"""What an update makes smaller: each grain's error, and what the errors of grains that move together add up to.
+
+Of the motions that can follow a state, a network trained on each grain's error learns an average, and an average moves
+less than what it is an average of: |E v|^2 <= E |v|^2 (Jensen). A step by step loss of speed and fluctuation is the
+result, and the better-known part of the error does not show it. So cells of grains, small against the flow and large
+against a collision (coarse graining: Goldhirsch 2010), must also keep, on average, the DEM's momentum and energy.
+"""
+
+from collections.abc import Sequence
+
+import torch
+from jaxtyping import Float, Int
+from torch import Tensor
+from torch import distributed as dist
+
+CELL_RADII = 8.0  # edge of a cell: 30 grains of a dense bed
+
+
+def mean_loss(error: Float[Tensor, "n d"], knee: float) -> Float[Tensor, ""]:
+    """Mean square of `error`, or, with a knee, the mean of sqrt(|e|^2 + knee^2) - knee over its groups e of three (the
+    pseudo-Huber loss, Charbonnier et al. 1997); 0 where there is none."""
+    if not knee:
+        return error.square().sum() / max(error.numel(), 1)
+    squares = error.view(len(error), error.shape[1] // 3, 3).square().sum(2)
+    return ((squares + knee**2).sqrt() - knee).sum() / max(squares.numel(), 1)
+
+
+def balance_loss(error: Float[Tensor, "n 3"], vel: Float[Tensor, "n 3"], cell: Int[Tensor, " n"]) -> Float[Tensor, ""]:
+    """How far cells are from the DEM's balance: the squares of their mean errors of momentum and of kinetic energy,
+    mean over grains; 0 where there is none.
+
+    Args:
+        error: of end velocities, over a scale of velocity.
+        vel: the DEM's, over the same scale.
+        cell: of each grain.
+    """
+    energy = (error * (vel + error / 2)).sum(1, keepdim=True)  # (v + e)^2 / 2 - v^2 / 2
+    rows = torch.cat([error, energy], dim=1)
+    count = torch.bincount(cell)
+    mean = rows.new_zeros(len(count), 4).index_add_(0, cell, rows) / count.clamp(min=1)[:, None]
+    return (count * mean.square().sum(1)).sum() / max(len(rows), 1)
+
+
+def cells(
+    pos: Float[Tensor, "n 3"], batch: Int[Tensor, " n"], size_m: float, randoms: Sequence[torch.Generator]
+) -> Int[Tensor, " n"]:
+    """The cell of each grain: cubes of edge `size_m`, laid in each graph at a place drawn from its generator."""
+    offset = torch.stack([torch.rand(3, dtype=pos.dtype, generator=random) for random in randoms]).to(pos.device)
+    place = torch.floor(pos / size_m + offset[batch]).long()
+    return torch.unique(torch.cat([batch[:, None], place], dim=1), dim=0, return_inverse=True)[1]
+
+
+def share_of_mean(rows: int, device: torch.device) -> float:
+    """What a process's mean over `rows` must be multiplied by, so that the mean over processes, which is what their
+    gradients are, is the mean over the rows of all: rows / (mean rows of a process)."""
+    if not dist.is_initialized() or dist.get_world_size() == 1:
+        return 1.0
+    total = torch.tensor(float(rows), device=device)
+    dist.all_reduce(total)
+    return rows * dist.get_world_size() / max(float(total), 1.0)

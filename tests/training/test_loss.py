@@ -1,0 +1,73 @@
+"""What training makes smaller."""
+
+import pytest
+import torch
+
+from gns_pyg.training.loss import balance_loss, cells, mean_loss
+
+
+def test_the_loss_is_a_square_below_the_knee_and_a_length_above():
+    error = torch.randn(50, 9, generator=torch.Generator().manual_seed(0), dtype=torch.float64)
+    assert mean_loss(error, 0.0).item() == pytest.approx(error.square().mean().item())
+    squares = error.view(50, 3, 3).square().sum(2)
+    assert mean_loss(error, 1e3).item() == pytest.approx((squares / 2e3).mean().item(), rel=1e-4)
+    assert mean_loss(error, 1e-9).item() == pytest.approx(squares.sqrt().mean().item(), rel=1e-6)
+    still = torch.zeros(4, 6, requires_grad=True)
+    for knee in (0.0, 0.02):
+        loss = mean_loss(still, knee)
+        assert loss.item() == 0
+        assert not torch.autograd.grad(loss, still)[0].any()  # finite: no root of zero
+        assert mean_loss(still[:0], knee).item() == 0
+
+
+def test_balance_is_the_square_of_what_a_cell_gains_together():
+    error = torch.tensor([[1.0, 0, 0], [-1.0, 0, 0], [0, 2.0, 0]], dtype=torch.float64)
+    vel = torch.tensor([[3.0, 0, 0], [3.0, 0, 0], [0, -1.0, 0]], dtype=torch.float64)
+    cell = torch.tensor([0, 0, 1])
+    # cell 0: no momentum; energies 3.5 and -2.5, mean 0.5. cell 1: momentum 2, energy 1/2 - 1/2
+    assert balance_loss(error, vel, cell).item() == pytest.approx((2 * 0.5**2 + 2.0**2) / 3)
+    still = torch.zeros(3, 3, requires_grad=True)
+    loss = balance_loss(still, vel.float(), cell)
+    assert loss.item() == 0
+    assert not torch.autograd.grad(loss, still)[0].any()
+    assert balance_loss(error[:0], vel[:0], cell[:0]).item() == 0
+
+
+@pytest.mark.parametrize("weight", [0.0, 1e4])
+def test_an_average_motion_loses_energy_unless_cells_must_keep_it(weight):
+    """Half of the grains move at 2, half at 0, each along its own direction, and who does cannot be known."""
+    random = torch.Generator().manual_seed(0)
+    direction = torch.nn.functional.normalize(torch.randn(2000, 3, generator=random, dtype=torch.float64), dim=1)
+    vel = 2 * direction * (torch.arange(2000) % 2)[:, None]
+    speed = torch.ones((), dtype=torch.float64, requires_grad=True)
+    optimizer = torch.optim.LBFGS([speed], max_iter=50, line_search_fn="strong_wolfe")
+
+    def loss():
+        optimizer.zero_grad()
+        error = speed * direction - vel
+        found = mean_loss(error, 0.0) + weight * balance_loss(error, vel, torch.zeros(2000, dtype=torch.long))
+        found.backward()
+        return found
+
+    optimizer.step(loss)
+    assert speed.item() == pytest.approx(2**0.5 if weight else 1.0, rel=1e-3)
+
+
+def test_cells_are_cubes_that_no_two_graphs_share_and_that_are_drawn_anew():
+    pos = torch.rand(400, 3, generator=torch.Generator().manual_seed(0), dtype=torch.float64)
+    batch = torch.arange(2).repeat_interleave(200)
+    pos[200:] = pos[:200]
+
+    def drawn(*seeds):
+        return cells(pos, batch, 0.4, [torch.Generator().manual_seed(seed) for seed in seeds])
+
+    found = drawn(1, 2)
+    for number in found.unique():
+        inside = found == number
+        assert len(batch[inside].unique()) == 1
+        assert ((pos[inside].amax(0) - pos[inside].amin(0)) < 0.4).all()
+    assert 2 * 8 <= len(found.unique()) <= 2 * 64
+    assert torch.equal(found, drawn(1, 2))
+    same = drawn(3, 3)  # two graphs, each with a generator of the same seed: the same cells
+    assert torch.equal(same[:200].unique(return_inverse=True)[1], same[200:].unique(return_inverse=True)[1])
+    assert not torch.equal(found[:200].unique(return_inverse=True)[1], found[200:].unique(return_inverse=True)[1])
