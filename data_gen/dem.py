@@ -50,7 +50,7 @@ def run_dem(
         progress: called after every stored frame.
 
     Raises:
-        DependencyError: if Yade is not installed.
+        DependencyError: if Yade, or h5py for its Python, is not installed.
         DataError: if Yade fails; its last lines are shown.
     """
     yade = shutil.which("yade")
@@ -87,6 +87,8 @@ def run_dem(
             status, tail = _follow(command, progress or (lambda *_: None))
         finally:
             clean_stale(path)
+    if any("No module named 'h5py'" in line for line in tail):
+        raise DependencyError("data generation", "no h5py in Yade's own Python", "h5py", "apt-get install python3-h5py")
     if status != 0 or not path.is_file():
         raise DataError(
             path,

@@ -185,6 +185,12 @@ class TestCommand:
             dem_run(tmp_path / "case.h5", scene, still([[0.0, 0.0, 0.0]], vel=np.full((1, 3), np.nan)))
         assert names(tmp_path) == []
 
+    def test_a_yade_without_h5py_says_what_to_install(self, tmp_path, monkeypatch) -> None:
+        (tmp_path / "h5py.py").write_text("raise ModuleNotFoundError(\"No module named 'h5py'\")")
+        monkeypatch.setenv("PYTHONPATH", str(tmp_path))
+        with pytest.raises(DependencyError, match="apt-get install python3-h5py"):
+            dem_run(tmp_path / "case.h5", scenes.scene(1, 2), still([[0.0, 0.0, 0.0]]))
+
     @pytest.mark.parametrize("victim", ["yade", "generate"])
     def test_kill_9_leaves_nothing_under_the_final_name(self, tmp_path, victim) -> None:
         process = subprocess.Popen(
