@@ -87,9 +87,10 @@ def run_dem(
             status, tail = _follow(command, progress or (lambda *_: None))
         finally:
             clean_stale(path)
-    if any("No module named 'h5py'" in line for line in tail):
-        raise DependencyError("data generation", "no h5py in Yade's own Python", "h5py", "apt-get install python3-h5py")
     if status != 0 or not path.is_file():
+        if any("No module named 'h5py'" in line for line in tail):
+            found = "no h5py in Yade's own Python"
+            raise DependencyError("data generation", found, "h5py", "apt-get install python3-h5py")
         raise DataError(
             path,
             f"Yade ended with status {status}; its last lines:\n    " + "\n    ".join(tail),

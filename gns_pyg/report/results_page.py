@@ -21,10 +21,10 @@ HEAD = """# Results
 
 Written by `make results` from [results.json](results.json): the bundles that ship with the project, on embedded Yade
 cases that they have not seen. These are the reduced scenes (220 to 300 grains), not the paper's; what was tried at full
-size, and how these bundles came about, is in [experiments.md](experiments.md) and [answers.md](answers.md). Means over
-unseen cases, ± the standard deviation over them; roll-outs from 0.1 s to the case's end, read every 10 ms. The last
-column says whether the goal that we set ourselves holds, on this scene and these cases. Times are of that run, whatever
-else the machine did; [performance.md](performance.md) measures speed with care.
+size, and how these bundles came about, is in [experiments.md](experiments.md), [answers.md](answers.md) and
+[balance.md](balance.md). Means over unseen cases, ± the standard deviation over them; roll-outs from 0.1 s to the
+case's end, read every 10 ms. The last column says whether the goal that we set ourselves holds, on this scene and these
+cases. Times are of that run, whatever else the machine did; [performance.md](performance.md) measures speed with care.
 """
 
 

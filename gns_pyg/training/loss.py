@@ -32,13 +32,13 @@ def balance_loss(error: Float[Tensor, "n 3"], vel: Float[Tensor, "n 3"], cell: I
     Args:
         error: of end velocities, over a scale of velocity.
         vel: the DEM's, over the same scale.
-        cell: of each grain.
+        cell: of each grain; numbers without gaps, as of `cells`.
     """
     energy = (error * (vel + error / 2)).sum(1, keepdim=True)  # (v + e)^2 / 2 - v^2 / 2
     rows = torch.cat([error, energy], dim=1)
     count = torch.bincount(cell)
-    mean = rows.new_zeros(len(count), 4).index_add_(0, cell, rows) / count.clamp(min=1)[:, None]
-    return (count * mean.square().sum(1)).sum() / max(len(rows), 1)
+    total = rows.new_zeros(len(count), 4).index_add_(0, cell, rows)
+    return (total.square().sum(1) / count).sum() / max(len(rows), 1)
 
 
 def cells(

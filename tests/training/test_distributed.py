@@ -52,8 +52,14 @@ class Share(TrainingModule):
 
 def module(rank=0, region=None):
     torch.manual_seed(0)
-    own = CONFIG | {"batch_size": 4, "unroll_from": 0.0, "unroll": 2, "region_grains": region, "average_decay": 0.0}
-    own["balance"] = 3.0
+    own = CONFIG | {
+        "batch_size": 4,
+        "unroll_from": 0.0,
+        "unroll": 2,
+        "region_grains": region,
+        "average_decay": 0.0,
+        "balance": 3.0,
+    }
     made = Share(simulator(scenes.scene(30, 5)), TrainingConfig(**own))
     made.global_rank = rank
     return made
