@@ -15,8 +15,9 @@ from gns_pyg import bundle, machine
 from gns_pyg.card import FILE as CARD
 from gns_pyg.card import card_page
 from gns_pyg.data.coverage import seen
-from gns_pyg.data.datamodule import EMBEDDED, find_cases, open_embedded, open_to_compare
+from gns_pyg.data.datamodule import find_cases, open_condition, open_to_compare
 from gns_pyg.data.trajectory import Trajectory
+from gns_pyg.dynamics.simulator import Simulator
 from gns_pyg.errors import DataError
 from gns_pyg.evaluation.baselines import Climatology
 from gns_pyg.evaluation.ensemble import curves, roll_out_ensemble
@@ -33,9 +34,12 @@ BUNDLES = {  # what ships -> conditions it was never trained on
     "hopper": ("hopper_small_fuller", "hopper_small_steeper", "hopper_small_smoother"),
     "drum": ("drum_small_fuller", "drum_small_faster", "drum_small_smoother"),
     "inclined_drum": (),
+    "hopper_full": ("hopper_fuller", "hopper_steeper", "hopper_smoother"),
+    "drum_full": ("drum_fuller", "drum_faster", "drum_smoother"),
 }
+REDUCED = ("hopper", "drum", "inclined_drum")  # the embedded data suffice
 DOCS = Path(__file__).parents[1] / "docs"
-START_S = 0.1
+START_S, COMPARE_S = 0.1, 0.01
 MEMBERS = 16
 PICTURES = (
     "one_step_error",
@@ -50,8 +54,9 @@ PICTURES = (
 log = logging.getLogger(__name__)
 
 
-def results(docs: Path, names: Sequence[str] = tuple(BUNDLES)) -> dict[str, Any]:
-    """Judges shipped bundles on the embedded cases that they have not seen, on long runs and on held-out conditions.
+def results(docs: Path, names: Sequence[str] = REDUCED) -> dict[str, Any]:
+    """Judges shipped bundles on the cases that they have not seen, on long runs and on held-out conditions: folders of
+    $GNS_DATA (or data/) or of the embedded data.
 
     Args:
         docs: folder of results.json, results.md and figures/.
@@ -72,9 +77,6 @@ def results(docs: Path, names: Sequence[str] = tuple(BUNDLES)) -> dict[str, Any]
         log.info("%s: %d unseen cases", name, len(unseen))
         evaluation = judge(simulator, unseen, expected, START_S)
         pictures(evaluation, replace(scene, frame_dt_s=unseen[0].frame_dt_s), docs / "figures", name)
-        ensemble = roll_out_ensemble(simulator, unseen[0], start_frame(unseen[0], START_S), MEMBERS)
-        title = f"{scene.name}, {unseen[0].path.stem}: {MEMBERS} roll-outs a micrometre apart"
-        ensemble_spread(ensemble, title).savefig(docs / "figures" / f"results_{name}_ensemble.png", dpi=110)
         found[scene.name] = {
             "bundle": name,
             "metrics": evaluation.metrics | {"speed/device": machine.processor()},
@@ -82,7 +84,7 @@ def results(docs: Path, names: Sequence[str] = tuple(BUNDLES)) -> dict[str, Any]
             "cases": evaluation.per_case,
             "trained_on": len(card["cases"]["train"]),
             "seed_scatter": seed_scatter(own, scene),
-            "ensemble": {key: value for key, value in ensemble.plain().items() if key != "observables"},
+            "ensemble": ensemble_of(name, simulator, unseen[0], docs / "figures") if name in REDUCED else None,
             "long": long_runs(name, scene),
             "held_out": {condition: held_out(name, condition, expected) for condition in conditions},
         }
@@ -91,8 +93,17 @@ def results(docs: Path, names: Sequence[str] = tuple(BUNDLES)) -> dict[str, Any]
     return found
 
 
+def ensemble_of(name: str, simulator: Simulator, case: Trajectory, folder: Path) -> dict[str, Any]:
+    """What an ensemble says of a case, without the curves of its observables; draws them."""
+    ensemble = roll_out_ensemble(simulator, case, start_frame(case, START_S), MEMBERS)
+    title = f"{simulator.scene.name}, {case.path.stem}: {MEMBERS} roll-outs a micrometre apart"
+    ensemble_spread(ensemble, title).savefig(folder / f"results_{name}_ensemble.png", dpi=110)
+    return {key: value for key, value in ensemble.plain().items() if key != "observables"}
+
+
 def own_cases(scene: Scene) -> list[Trajectory]:
-    return [open_to_compare(path, scene) for path in find_cases(scene, str(EMBEDDED / scene.name))]
+    paths = find_cases(scene, None)
+    return [open_to_compare(path, scene, max(COMPARE_S, Trajectory(path).frame_dt_s)) for path in paths]
 
 
 def kept_for_testing(cases: Sequence[Trajectory], scene: Scene, card: Mapping[str, Any]) -> list[Trajectory]:
@@ -126,13 +137,15 @@ def rewrite_pages(docs: Path = DOCS) -> None:
 def held_out(name: str, condition: str, expected: Climatology) -> dict[str, Any]:
     """Metrics of the bundle's networks in a scene that they were never trained on, beside the training cases' mean."""
     log.info("held out: %s", condition)
-    found = open_embedded(condition, bundle.load(name).scene.frame_dt_s)
-    if found is None:
-        raise DataError(
-            EMBEDDED / condition, "no cases", "the held-out cases", "python -m data_gen.generate, docs/scenes.md"
-        )
-    scene, cases = found
+    scene, cases = _condition(condition, bundle.load(name).scene.frame_dt_s)
     return judge(bundle.load(name, scene), cases, expected, START_S).metrics
+
+
+def _condition(name: str, frame_dt_s: float) -> tuple[Scene, list[Trajectory]]:
+    found = open_condition(name, frame_dt_s)
+    if found is None:
+        raise DataError(name, "no such folder of cases", "one in $GNS_DATA or data/", "generate them, docs/results.md")
+    return found
 
 
 def long_runs(name: str, scene: Scene) -> dict[str, Any]:
@@ -146,12 +159,11 @@ def long_runs(name: str, scene: Scene) -> dict[str, Any]:
         DataError: for a case that starts as one that the bundle was trained on.
     """
     simulator, card, cases = bundle.load(name), bundle.card(name), []
-    for path in sorted((EMBEDDED / f"{scene.name}_long").glob("case_*.h5")):
-        log.info("long: %s", path.name)
-        case = open_to_compare(path, scene)
+    for case in _condition(f"{scene.name}_long", scene.frame_dt_s)[1]:
+        log.info("long: %s", case.path.name)
         if seen(case, scene, card):
             remedy = "train without the case that starts alike"
-            raise DataError(path, "a start that the bundle was trained on", "one that it has not seen", remedy)
+            raise DataError(case.path, "a start that the bundle was trained on", "one that it has not seen", remedy)
         start = start_frame(case, START_S)
         times_s, pos = case.times_s[start:], roll_out(simulator, case, start)[0]
         half = len(times_s) // 2
@@ -169,7 +181,7 @@ def spread(per_case: Sequence[Mapping[str, Any]]) -> dict[str, float]:
     return {
         key: float(np.std([case[key] for case in per_case], ddof=1)) if len(per_case) > 1 else float("nan")
         for key in per_case[0]
-        if key != "case" and all(isinstance(case[key], int | float) for case in per_case)
+        if key != "case" and all(isinstance(case.get(key), int | float) for case in per_case)
     }
 
 
@@ -196,4 +208,4 @@ def pictures(evaluation: Evaluation, scene: Scene, folder: Path, name: str) -> N
 
 if __name__ == "__main__":
     logging.basicConfig(level=logging.INFO, format="%(message)s")
-    results(DOCS, sys.argv[1:] or tuple(BUNDLES))
+    results(DOCS, sys.argv[1:] or REDUCED)

@@ -70,10 +70,7 @@ def find_cases(scene: Scene, folder: str | None) -> list[Path]:
     Raises:
         DataError: if there is none; says where it looked and how to generate them.
     """
-    if folder is not None:
-        places = [Path(folder)]
-    else:
-        places = [Path(os.environ.get("GNS_DATA", "data")) / scene.name, EMBEDDED / scene.name]
+    places = [Path(folder)] if folder is not None else _places(scene.name)
     for place in places:
         if cases := sorted(place.glob("case_*.h5")):
             return cases
@@ -84,6 +81,10 @@ def find_cases(scene: Scene, folder: str | None) -> list[Path]:
         f"generate them: python -m data_gen.generate -m scene={scene.name} 'case=range({scene.cases})', "
         "or name their folder: data.dir=...",
     )
+
+
+def _places(name: str) -> list[Path]:
+    return [Path(os.environ.get("GNS_DATA", "data")) / name, EMBEDDED / name]
 
 
 def open_case(path: str | Path, scene: Scene) -> Trajectory:
@@ -128,11 +129,12 @@ def open_to_compare(path: str | Path, scene: Scene, every_s: float | None = None
     return open_case(path, replace(scene, frame_dt_s=round(steps) * scene.frame_dt_s))
 
 
-def open_embedded(folder: str, frame_dt_s: float) -> tuple[Scene, list[Trajectory]] | None:
-    """The cases of a folder of the embedded data, opened to be compared with a simulator of steps of `frame_dt_s`, and
-    their scene, which is the first one's; None where there is no such folder."""
-    paths = sorted((EMBEDDED / folder).glob("case_*.h5"))
-    if not paths:
+def open_condition(name: str, frame_dt_s: float) -> tuple[Scene, list[Trajectory]] | None:
+    """The cases of a folder of that name in $GNS_DATA (or data/) or the embedded data, opened to be compared with a
+    simulator of steps of `frame_dt_s`, and their scene, which is the first one's; None where there is no such
+    folder."""
+    paths = next((found for place in _places(name) if (found := sorted(place.glob("case_*.h5")))), None)
+    if paths is None:
         return None
     scene = replace(Scene.from_config(Trajectory(paths[0]).scene), frame_dt_s=frame_dt_s)
     return scene, [open_to_compare(path, scene) for path in paths]
@@ -158,7 +160,8 @@ def split(scene: Scene, config: DataConfig) -> Split:
             trajectories[0].path.parent,
             f"{len(trajectories)} case(s), of which {n_test} for testing and {config.val_cases} for validation",
             "at least one left to train on",
-            "generate more cases, or lower data.test_fraction or data.val_cases",
+            f"generate more (python -m data_gen.generate -m scene={scene.name} 'case=range({scene.cases})'), or lower "
+            "data.test_fraction or data.val_cases",
         )
     train = trajectories[:n_train]
     return Split(

@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 import torch
 
-from gns_pyg.data.datamodule import open_embedded
+from gns_pyg.data.datamodule import open_condition
 from gns_pyg.data.trajectory import Trajectory
 from gns_pyg.dynamics.rollout import rollout
 from gns_pyg.dynamics.simulator import Simulator
@@ -78,7 +78,7 @@ class Bench:
     def recorded(self, kind: str) -> Trajectory | None:
         """The first embedded DEM run of the scene that is `long`, or with walls that are `still`, or None."""
         own = self.simulator.scene
-        found = open_embedded(f"{own.name}_{kind}", own.frame_dt_s)
+        found = open_condition(f"{own.name}_{kind}", own.frame_dt_s)
         return None if found is None else found[1][0]
 
     def escaped(self, state: State, simulator: Simulator | None = None) -> int:

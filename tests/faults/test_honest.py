@@ -14,7 +14,7 @@ from gns_pyg.errors import ConfigError, DataError
 from gns_pyg.evaluation.judge import judge
 from gns_pyg.evaluation.metrics import write_json
 from gns_pyg.evaluation.twins import read_twins, twins_path
-from gns_pyg.results import BUNDLES, kept_for_testing, long_runs, own_cases
+from gns_pyg.results import REDUCED, kept_for_testing, long_runs, own_cases
 from gns_pyg.scene.scene import Scene
 from tests.faults import samples
 
@@ -81,7 +81,7 @@ def test_twins_of_another_run_are_refused(data):
         read_twins(second, second.times_s)
 
 
-@pytest.mark.parametrize("name", BUNDLES)
+@pytest.mark.parametrize("name", REDUCED)
 def test_results_are_those_of_the_runs_that_a_bundle_kept_for_testing(name):
     scene, card = bundle.load(name).scene, bundle.card(name)
     cases = own_cases(scene)
