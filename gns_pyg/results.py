@@ -64,7 +64,7 @@ def results(docs: Path, names: Sequence[str] = REDUCED) -> dict[str, Any]:
 
     Returns:
         Scene name -> its `metrics` (the mean over unseen cases), `spread` (their standard deviation), `cases`,
-        `seed_scatter` of DEM, `ensemble`, `long` and `held_out`; what is written to results.json.
+        `seed_scatter` of DEM, `ensemble` (None for full size), `long` and `held_out`; what is written to results.json.
     """
     path = docs / "results.json"
     found: dict[str, Any] = json.loads(path.read_text()) if path.exists() else {}
