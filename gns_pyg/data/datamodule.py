@@ -151,18 +151,19 @@ def split(scene: Scene, config: DataConfig) -> Split:
     Raises:
         DataError: if a case cannot be used (see `open_case`) or is there twice, or if too few are left to train on.
     """
-    trajectories = open_cases(scene, config.dir)
-    check_all_differ(trajectories)
-    n_test = math.ceil(config.test_fraction * len(trajectories))
-    n_train = len(trajectories) - n_test - config.val_cases
+    paths = find_cases(scene, config.dir)
+    n_test = math.ceil(config.test_fraction * len(paths))
+    n_train = len(paths) - n_test - config.val_cases
     if n_train < 1:
         raise DataError(
-            trajectories[0].path.parent,
-            f"{len(trajectories)} case(s), of which {n_test} for testing and {config.val_cases} for validation",
+            paths[0].parent,
+            f"{len(paths)} case(s), of which {n_test} for testing and {config.val_cases} for validation",
             "at least one left to train on",
             f"generate more (python -m data_gen.generate -m scene={scene.name} 'case=range({scene.cases})'), or lower "
             "data.test_fraction or data.val_cases",
         )
+    trajectories = open_cases(scene, config.dir)
+    check_all_differ(trajectories)
     train = trajectories[:n_train]
     return Split(
         train,
