@@ -144,12 +144,12 @@ def held_out(name: str, condition: str, expected: Climatology) -> dict[str, Any]
 def _condition(name: str, frame_dt_s: float) -> tuple[Scene, list[Trajectory]]:
     found = open_condition(name, frame_dt_s)
     if found is None:
-        raise DataError(name, "no such folder of cases", "one in $GNS_DATA or data/", "generate them, docs/results.md")
+        raise DataError(name, "no such folder of cases", "one in $GNS_DATA or data/", "generate them, docs/balance.md")
     return found
 
 
 def long_runs(name: str, scene: Scene) -> dict[str, Any]:
-    """Roll-outs ten times as long as those trained on (drums: five times), beside DEM runs of the same length.
+    """Roll-outs ten times as long as those trained on (reduced drums: five times), beside DEM runs of the same length.
 
     Returns:
         `duration_s`; per case `angle_of_repose_deg`, mean over the steady part, and its `_standard_error_deg`, each
@@ -177,7 +177,7 @@ def long_runs(name: str, scene: Scene) -> dict[str, Any]:
 
 
 def spread(per_case: Sequence[Mapping[str, Any]]) -> dict[str, float]:
-    """Standard deviation over cases of every figure; nan for a single case."""
+    """Standard deviation over cases of every figure that all have; nan for a single case."""
     return {
         key: float(np.std([case[key] for case in per_case], ddof=1)) if len(per_case) > 1 else float("nan")
         for key in per_case[0]

@@ -71,9 +71,8 @@ def find_cases(scene: Scene, folder: str | None) -> list[Path]:
         DataError: if there is none; says where it looked and how to generate them.
     """
     places = [Path(folder)] if folder is not None else _places(scene.name)
-    for place in places:
-        if cases := sorted(place.glob("case_*.h5")):
-            return cases
+    if cases := _first_cases(places):
+        return cases
     raise DataError(
         " and ".join(str(place) for place in places),
         "no case_*.h5",
@@ -85,6 +84,10 @@ def find_cases(scene: Scene, folder: str | None) -> list[Path]:
 
 def _places(name: str) -> list[Path]:
     return [Path(os.environ.get("GNS_DATA", "data")) / name, EMBEDDED / name]
+
+
+def _first_cases(places: Sequence[Path]) -> list[Path]:
+    return next((found for place in places if (found := sorted(place.glob("case_*.h5")))), [])
 
 
 def open_case(path: str | Path, scene: Scene) -> Trajectory:
@@ -133,8 +136,8 @@ def open_condition(name: str, frame_dt_s: float) -> tuple[Scene, list[Trajectory
     """The cases of a folder of that name in $GNS_DATA (or data/) or the embedded data, opened to be compared with a
     simulator of steps of `frame_dt_s`, and their scene, which is the first one's; None where there is no such
     folder."""
-    paths = next((found for place in _places(name) if (found := sorted(place.glob("case_*.h5")))), None)
-    if paths is None:
+    paths = _first_cases(_places(name))
+    if not paths:
         return None
     scene = replace(Scene.from_config(Trajectory(paths[0]).scene), frame_dt_s=frame_dt_s)
     return scene, [open_to_compare(path, scene) for path in paths]

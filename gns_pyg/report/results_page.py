@@ -4,13 +4,13 @@ import math
 from collections.abc import Callable, Mapping
 from typing import Any
 
-SCORES = {
+SCORES = {  # goals of the one-step error, m
     "hopper": 3.0e-4,
     "drum": 4.0e-4,
     "inclined_drum": 4.0e-4,
     "hopper_full": 3.0e-4,
     "drum_full": 4.0e-4,
-}  # goals of the one-step error, m
+}
 Z_95 = 1.96
 CAPTIONS = {
     "one_step_error": "one-step error along the run",

@@ -14,7 +14,7 @@ from gns_pyg.errors import ConfigError, DataError
 from gns_pyg.evaluation.judge import judge
 from gns_pyg.evaluation.metrics import write_json
 from gns_pyg.evaluation.twins import read_twins, twins_path
-from gns_pyg.results import REDUCED, kept_for_testing, long_runs, own_cases
+from gns_pyg.results import BUNDLES, REDUCED, kept_for_testing, long_runs, own_cases
 from gns_pyg.scene.scene import Scene
 from tests.faults import samples
 
@@ -88,6 +88,13 @@ def test_results_are_those_of_the_runs_that_a_bundle_kept_for_testing(name):
     assert [case.path.name for case in kept_for_testing(cases, scene, card)] == sorted(card["cases"]["test"])
     with pytest.raises(DataError, match="those that the bundle kept"):
         kept_for_testing(cases[:-1], scene, card)
+
+
+@pytest.mark.parametrize("name", sorted({*BUNDLES} - {*REDUCED}))
+def test_the_one_embedded_case_of_a_full_scene_does_not_stand_for_all_that_were_kept(name):
+    scene, card = bundle.load(name).scene, bundle.card(name)
+    with pytest.raises(DataError, match="those that the bundle kept"):
+        kept_for_testing(own_cases(scene), scene, card)
 
 
 def test_resuming_with_other_data_is_refused_and_the_difference_named(data, tmp_path):
