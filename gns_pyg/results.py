@@ -19,7 +19,7 @@ from gns_pyg.data.datamodule import find_cases, open_condition, open_to_compare
 from gns_pyg.data.trajectory import Trajectory
 from gns_pyg.dynamics.simulator import Simulator
 from gns_pyg.errors import DataError
-from gns_pyg.evaluation.baselines import Climatology
+from gns_pyg.evaluation.baselines import Climatology, of_material
 from gns_pyg.evaluation.ensemble import curves, roll_out_ensemble
 from gns_pyg.evaluation.errors import nanmean, positions
 from gns_pyg.evaluation.judge import judge
@@ -83,7 +83,7 @@ def results(docs: Path, names: Sequence[str] = REDUCED) -> dict[str, Any]:
             "spread": spread(evaluation.per_case),
             "cases": evaluation.per_case,
             "trained_on": len(card["cases"]["train"]),
-            "seed_scatter": seed_scatter(own, scene),
+            "seed_scatter": seed_scatter(of_material(own, scene), scene),
             "ensemble": ensemble_of(name, simulator, unseen[0], docs / "figures") if name in REDUCED else None,
             "long": long_runs(name, scene),
             "held_out": {condition: held_out(name, condition, expected) for condition in conditions},
@@ -149,11 +149,13 @@ def _condition(name: str, frame_dt_s: float) -> tuple[Scene, list[Trajectory]]:
 
 
 def long_runs(name: str, scene: Scene) -> dict[str, Any]:
-    """Roll-outs ten times as long as those trained on (reduced drums: five times), beside DEM runs of the same length.
+    """Roll-outs several times (at least one: ten times; reduced drums: five) as long as those trained on, beside DEM
+    runs of the same length.
 
     Returns:
-        `duration_s`; per case `angle_of_repose_deg`, mean over the steady part, and its `_standard_error_deg`, each
-        with `_dem`; `escaped_grains`, the most at any frame; `late_mean_speed_m_s` over the last half, and `_dem`.
+        `cases`: per case `duration_s`; `angle_of_repose_deg`, mean over the steady part, and its
+        `_standard_error_deg`, each with `_dem`; `escaped_grains`, the most at any frame; `late_mean_speed_m_s` over the
+        last half, and `_dem`.
 
     Raises:
         DataError: for a case that starts as one that the bundle was trained on.
@@ -167,13 +169,14 @@ def long_runs(name: str, scene: Scene) -> dict[str, Any]:
         start = start_frame(case, START_S)
         times_s, pos = case.times_s[start:], roll_out(simulator, case, start)[0]
         half = len(times_s) // 2
-        entry: dict[str, Any] = {"escaped_grains": int(escaped_grains(pos, times_s, scene).max())}
+        entry: dict[str, Any] = {"duration_s": float(times_s[-1])}
+        entry["escaped_grains"] = int(escaped_grains(pos, times_s, scene).max())
         for suffix, where in (("", pos), ("_dem", positions(case, start))):
             angle, error = time_mean(angle_of_repose(where, scene)[from_frame(times_s, scene) :])
             entry |= {f"angle_of_repose{suffix}_deg": angle, f"angle_of_repose{suffix}_standard_error_deg": error}
             entry[f"late_mean_speed{suffix}_m_s"] = nanmean(mean_speed(where, times_s)[half:])
         cases.append(entry)
-    return {"duration_s": float(times_s[-1]), "cases": cases}
+    return {"cases": cases}
 
 
 def spread(per_case: Sequence[Mapping[str, Any]]) -> dict[str, float]:

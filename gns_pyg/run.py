@@ -16,12 +16,13 @@ from omegaconf import DictConfig, OmegaConf
 from pytorch_lightning.callbacks import Timer
 from pytorch_lightning.utilities.exceptions import MisconfigurationException
 from pytorch_lightning.utilities.rank_zero import rank_zero_only
+from torch import nn
 
 from gns_pyg import bundle, machine
 from gns_pyg.config import check_keys, flat, plain, require, typed
 from gns_pyg.data.coverage import coverage, outside_coverage, seen, values
 from gns_pyg.data.datamodule import DataConfig, DataModule, Split, find_cases, open_to_compare, split
-from gns_pyg.data.statistics import measure
+from gns_pyg.data.statistics import measure, scales_of_parameters
 from gns_pyg.data.trajectory import Trajectory
 from gns_pyg.dynamics.execution import Execution
 from gns_pyg.dynamics.integrator import Integrator
@@ -51,6 +52,7 @@ from gns_pyg.training.config import TrainingConfig
 from gns_pyg.training.module import TrainingModule
 
 GROUPS = ["scene", "model", "requires", "data", "training", "trainer", "callbacks", "logger"]
+MATERIAL, ENCODER = "requires.material_features", "encode_grain.0.weight"
 TRAIN_KEYS = ["name", "start_s", "compare_every_s", "ckpt_path", "device", "folder", *GROUPS]
 log = logging.getLogger(__name__)
 
@@ -253,7 +255,8 @@ def build(
     scene: Scene, config: ModelConfig, requires: Requirements, cases: Split, training: TrainingConfig
 ) -> Simulator:
     """A simulator for a scene: its scales measured on the training cases and its weights drawn from the seed, or both
-    taken from the bundle `training.start_from`.
+    taken from the bundle `training.start_from`. If parameters vary here and none did there, impulse networks gain them
+    as inputs of weight zero: it predicts what the bundle does until it is trained.
 
     Raises:
         BundleError: if that bundle cannot be read.
@@ -267,7 +270,8 @@ def build(
         )
         elsewhere = ("requires.reasons", "requires.symmetry")  # training turns windows by it, networks do not know it
         differ = [key for key in sorted({*here, *there}) if here.get(key) != there.get(key)]
-        keys = [key for key in differ if not key.startswith(elsewhere)]
+        gained = requires.material_features if start.config.network == "impulse" and not there[MATERIAL] else []
+        keys = [key for key in differ if not key.startswith(elsewhere) and not (gained and key == MATERIAL)]
         require(
             not keys,
             "training.start_from",
@@ -276,6 +280,9 @@ def build(
             "start from a bundle of this model",
         )
         statistics = start.statistics
+        if gained:
+            mean, std = scales_of_parameters(cases.train)
+            statistics = replace(statistics, parameters_mean=mean, parameters_std=std)
     else:
         statistics = measure(cases.train, Integrator(scene, requires.state, free_flight=requires.free_flight))
     points = boundary_points(scene, config.cutoff_wall_radii)
@@ -284,6 +291,8 @@ def build(
         simulator = Simulator(scene, config, requires, points, statistics)
     if start is not None:
         networks = {key: value for key, value in start.state_dict().items() if not key.startswith("boundary.")}
+        if gained:
+            networks[ENCODER] = nn.functional.pad(networks[ENCODER], (0, len(gained)))  # its last inputs
         simulator.load_state_dict(networks, strict=False)
     return simulator
 

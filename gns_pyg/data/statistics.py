@@ -16,7 +16,6 @@ FRAMES_PER_CASE = 50
 def measure(trajectories: Sequence[Trajectory], integrator: Integrator) -> Statistics:
     """Root mean squares over frames spread evenly over the training cases (see `Statistics`)."""
     velocity, spin, position, corrections = [], [], [], []
-    values = np.array([parameters(trajectory) for trajectory in trajectories])
     for trajectory in trajectories:
         last = trajectory.n_frames - 3
         for start in np.unique(np.linspace(0, max(last, 0), FRAMES_PER_CASE).astype(int)):
@@ -30,7 +29,8 @@ def measure(trajectories: Sequence[Trajectory], integrator: Integrator) -> Stati
             position.append(state.pos)
             groups = integrator.target(state, following).split(3, dim=1)
             corrections.append(torch.stack([group.square().mean() for group in groups]))
-    everywhere, mean, std = torch.cat(position), values.mean(axis=0), values.std(axis=0)
+    everywhere = torch.cat(position)
+    mean, std = scales_of_parameters(trajectories)
     return Statistics(
         velocity_m_s=_root(velocity),
         spin_rad_s=max(_root(spin), 1e-12),
@@ -38,9 +38,16 @@ def measure(trajectories: Sequence[Trajectory], integrator: Integrator) -> Stati
         correction=torch.stack(corrections).mean(0).sqrt().tolist(),
         position_mean_m=everywhere.mean(0).tolist(),
         position_std_m=float((everywhere - everywhere.mean(0)).square().mean().sqrt()),
-        parameters_mean=mean.tolist(),
-        parameters_std=np.where(std > 1e-9 * np.abs(mean), std, 1.0).tolist(),
+        parameters_mean=mean,
+        parameters_std=std,
     )
+
+
+def scales_of_parameters(trajectories: Sequence[Trajectory]) -> tuple[list[float], list[float]]:
+    """Mean and standard deviation, over cases, of the values of `scene.PARAMETERS`; 1 where one does not vary."""
+    values = np.array([parameters(trajectory) for trajectory in trajectories])
+    mean, std = values.mean(axis=0), values.std(axis=0)
+    return mean.tolist(), np.where(std > 1e-9 * np.abs(mean), std, 1.0).tolist()
 
 
 def _root(squares: list[torch.Tensor]) -> float:

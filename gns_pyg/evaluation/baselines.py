@@ -11,6 +11,7 @@ import numpy as np
 import torch
 
 from gns_pyg.data.trajectory import Trajectory
+from gns_pyg.data.windows import parameters
 from gns_pyg.evaluation.errors import mean_present, nanmax, nanmean, position_error, positions
 from gns_pyg.evaluation.observables import angle_of_repose, center_of_mass, from_frame, outflow
 from gns_pyg.scene.free_flight import free_flight
@@ -115,7 +116,10 @@ class Climatology:
 
 
 def climatology(trajectories: Sequence[Trajectory], scene: Scene) -> Climatology:
-    """Averages the training cases' curves, aligned by time (linear between frames) on the first case's frames."""
+    """Averages the training cases' curves, aligned by time (linear between frames) on the first case's frames. Where
+    parameters vary: of the cases that have the scene's own, as someone would who knows the material, if there are any.
+    """
+    trajectories = of_material(trajectories, scene) or trajectories
     times_s = trajectories[0].times_s
     centers, angles, left = [], [], []
     for trajectory in trajectories:
@@ -128,6 +132,11 @@ def climatology(trajectories: Sequence[Trajectory], scene: Scene) -> Climatology
     mean_angle = np.array([nanmean(frame) for frame in np.array(angles).T]) if angles else None
     mean_left = mean_present(np.array(left), axis=0) if left else None
     return Climatology(times_s, mean_present(np.array(centers), axis=0), mean_angle, mean_left)
+
+
+def of_material(trajectories: Sequence[Trajectory], scene: Scene) -> list[Trajectory]:
+    """The cases that have the scene's own parameters, where these vary from case to case."""
+    return [case for case in trajectories if parameters(case) == list(scene.parameters.values())]
 
 
 def _at(times_s: np.ndarray, known_s: np.ndarray, curve: np.ndarray) -> np.ndarray:

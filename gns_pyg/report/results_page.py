@@ -1,8 +1,11 @@
 """docs/results.md from docs/results.json: every figure beside what it is to be held against, and whether it holds."""
 
 import math
-from collections.abc import Callable, Mapping
+import statistics
+from collections.abc import Callable, Mapping, Sequence
 from typing import Any
+
+from scipy.stats import t
 
 SCORES = {  # goals of the one-step error, m
     "hopper": 3.0e-4,
@@ -62,16 +65,19 @@ def _scene(name: str, values: Mapping[str, Any]) -> str:
             + ", ".join(f"{key} {score:.3g}" for key, score in ensemble["crps"].items())
             + f". Escaped grains, most of any member: {ensemble['escaped_grains']}."
         ]
-    long, cases = values["long"], values["long"]["cases"]
+    cases = values["long"]["cases"]
     lines += [
-        f"\nRuns of {long['duration_s']:g} s, beside DEM runs as long, read every 50 ms:\n",
-        "| case | angle of repose, steady part, degrees | DEM | mean speed in the last half, m/s | DEM | grains lost |",
+        "\nLong runs, beside DEM runs as long, read every 50 ms:\n",
+        "| duration, s | angle of repose, steady part, degrees | DEM | mean speed in the last half, m/s | DEM "
+        "| grains lost |",
         "|---|---|---|---|---|---|",
         *(
-            f"| {number} | {_angle(case, '')} | {_angle(case, '_dem')} | {_text(case['late_mean_speed_m_s'], 1.0)} "
-            f"| {_text(case['late_mean_speed_dem_m_s'], 1.0)} | {case['escaped_grains']} |"
-            for number, case in enumerate(cases, 1)
+            f"| {case['duration_s']:g} | {_angle(case, '')} | {_angle(case, '_dem')} "
+            f"| {_text(case['late_mean_speed_m_s'], 1.0)} | {_text(case['late_mean_speed_dem_m_s'], 1.0)} "
+            f"| {case['escaped_grains']} |"
+            for case in cases
         ),
+        *_equivalence(cases),
     ]
     if values["held_out"]:
         lines += [
@@ -175,6 +181,22 @@ def _rows(bundle: str, m: Mapping[str, Any], spread: Mapping[str, Any], scatter:
 def _angle(case: Mapping[str, Any], of: str) -> str:
     error = case[f"angle_of_repose{of}_standard_error_deg"]
     return f"{_text(case[f'angle_of_repose{of}_deg'], 1.0)} ± {_text(error, 1.0, 2)}"
+
+
+def _equivalence(cases: Sequence[Mapping[str, Any]]) -> list[str]:
+    """Whether the angles of long runs are those of DEM within 1 degree: the mean difference and its 95 % confidence
+    interval (Student's t over the cases); nothing for less than three cases."""
+    known = [case for case in cases if case["angle_of_repose_deg"] is not None]
+    if len(known) < 3:
+        return []
+    off = [case["angle_of_repose_deg"] - case["angle_of_repose_dem_deg"] for case in known]
+    mean, error = statistics.mean(off), statistics.stdev(off) / math.sqrt(len(off))
+    within = error * t.ppf(0.975, len(off) - 1)
+    holds = abs(mean) + within <= 1.0
+    return [
+        f"\nAngle of repose in long runs: {mean:+.2f} ± {within:.2f} degrees off (95 %, {len(off)} cases); within 1 "
+        f"degree: {'yes' if holds else '**no**'}."
+    ]
 
 
 def _condition(condition: str, m: Mapping[str, Any]) -> str:

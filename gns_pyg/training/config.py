@@ -28,7 +28,8 @@ class TrainingConfig:
             length; 0 is the mean square throughout (the paper).
         balance: weight of the momentum and the energy that cells of some 30 grains wrongly gain or lose together. (Each
             grain's own error is smallest for an average motion, which loses speed at every step.) 0 leaves it out.
-        start_from: a bundle whose weights and scales training starts from; null draws and measures them.
+        start_from: a bundle whose weights and scales training starts from; null draws and measures them. Parameters
+            that vary here, where none did there, become inputs (impulse networks).
         average_decay: the weights' exponential moving average with this decay is what is judged and saved; 0 is none.
     """
 

@@ -41,3 +41,20 @@ def test_a_missed_goal_says_no(key, value, row):
     changed = {"hopper_small": scene | {"metrics": scene["metrics"] | {key: value}}}
     line = next(line for line in results_page(changed).splitlines() if line.startswith(f"| {row}"))
     assert line.endswith("**no** |")
+
+
+@pytest.mark.parametrize(
+    ("off", "said"),
+    [
+        ([0.1, -0.1, 0.0, 0.2], "+0.05 ± 0.21 degrees off (95 %, 4 cases); within 1 degree: yes"),
+        ([1.1, 0.9, 1.0, 1.2], "within 1 degree: **no**"),  # well known, and too much
+        ([3.0, -3.0, 0.0], "within 1 degree: **no**"),  # right on average, hardly known
+        ([0.1, -0.1], None),
+    ],
+)
+def test_angles_of_long_runs_are_held_against_one_degree_from_three_cases_on(off, said):
+    case = STORED["drum"]["long"]["cases"][0]
+    cases = [case | {"angle_of_repose_deg": case["angle_of_repose_dem_deg"] + by} for by in off]
+    page = results_page({"drum": STORED["drum"] | {"long": {"cases": cases}}})
+    assert ("Angle of repose in long runs" in page) == (said is not None)
+    assert said is None or said in page
