@@ -64,7 +64,7 @@ def results(docs: Path, names: Sequence[str] = REDUCED) -> dict[str, Any]:
 
     Returns:
         Scene name -> its `metrics` (the mean over unseen cases), `spread` (their standard deviation), `cases`,
-        `seed_scatter` of DEM, `ensemble` (None for full size), `long` and `held_out`; what is written to results.json.
+        `seed_scatter` of DEM, `ensemble`, `long` and `held_out`; what is written to results.json.
     """
     path = docs / "results.json"
     found: dict[str, Any] = json.loads(path.read_text()) if path.exists() else {}
@@ -84,7 +84,7 @@ def results(docs: Path, names: Sequence[str] = REDUCED) -> dict[str, Any]:
             "cases": evaluation.per_case,
             "trained_on": len(card["cases"]["train"]),
             "seed_scatter": seed_scatter(of_material(own, scene), scene),
-            "ensemble": ensemble_of(name, simulator, unseen[0], docs / "figures") if name in REDUCED else None,
+            "ensemble": ensemble_of(name, simulator, unseen[0], docs / "figures"),
             "long": long_runs(name, scene),
             "held_out": {condition: held_out(name, condition, expected) for condition in conditions},
         }
