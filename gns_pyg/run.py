@@ -270,7 +270,8 @@ def build(
         )
         elsewhere = ("requires.reasons", "requires.symmetry")  # training turns windows by it, networks do not know it
         differ = [key for key in sorted({*here, *there}) if here.get(key) != there.get(key)]
-        gained = requires.material_features if start.config.network == "impulse" and not there[MATERIAL] else []
+        can_gain = start.config.network == "impulse" and not start.requires.material_features
+        gained = requires.material_features if can_gain else []
         keys = [key for key in differ if not key.startswith(elsewhere) and not (gained and key == MATERIAL)]
         require(
             not keys,

@@ -7,7 +7,7 @@ import pytest
 
 from gns_pyg import bundle
 from gns_pyg.card import FILE, card_page
-from gns_pyg.results import BUNDLES, REDUCED
+from gns_pyg.results import BUNDLES
 from tests import scenes
 from tests.simulators import simulator
 
@@ -35,8 +35,7 @@ def test_a_card_tells_data_scene_range_errors_speed_and_licence(name):
     for what, (low, high) in card["coverage"].items():
         assert f"| {what} | {low:.4g} | {high:.4g} |" in text
     assert f"{1e3 * metrics['test/one_step_error_m']:.4g} mm" in text
-    if name in REDUCED:  # twins of every test case
-        assert f"{1e3 * metrics['test/rollout_error_final_twin_m']:.4g} DEM twins" in text
+    assert f"{1e3 * metrics['test/rollout_error_final_twin_m']:.4g} DEM twins" in text
     assert f"| {metrics['speed/seconds_per_simulated_second']:.4g} on {metrics['speed/device']} |" in text
     assert f"{metrics['speed/yade_seconds_per_simulated_second']:.4g} Yade" in text
     assert all(reason in text for reason in description["requires"]["reasons"].values())

@@ -165,7 +165,7 @@ def split(scene: Scene, config: DataConfig) -> Split:
             f"generate more (python -m data_gen.generate -m scene={scene.name} 'case=range({scene.cases})'), or lower "
             "data.test_fraction or data.val_cases",
         )
-    trajectories = open_cases(scene, config.dir)
+    trajectories = [open_case(path, scene) for path in paths]
     check_all_differ(trajectories)
     train = trajectories[:n_train]
     return Split(

@@ -34,7 +34,7 @@ paper's at full size (`hopper_full`, `drum_full`; on cases made by the commands 
 bundles came about is in [experiments.md](experiments.md), [answers.md](answers.md) and [balance.md](balance.md). Means
 over unseen cases, ± the standard deviation over them; roll-outs from 0.1 s to the end, read every 10 ms. The last
 column says whether the goal that we set ourselves holds, on this scene and these cases. Times are of that run, whatever
-else the machine did, Yade's too (alone, it is twice as fast at full size, and faster than the network:
+else the machine did, Yade's too (alone, it takes half as long on the full-size hopper, less than the network:
 [balance.md](balance.md)); [performance.md](performance.md) measures speed with care.
 """
 
