@@ -3,13 +3,14 @@
 Reads FOLDER/graph.npz and writes FOLDER/SYSTEM.npz: weights, output and weight gradients on that graph, with the
 weights laid out as `ContactNetwork` reads them. Says who it is, and how long the first calls took; then answers every
 line on stdin, "forward" or "forward_backward", with its wall-clock and processor seconds. Lines on stdout are JSON.
-Imports nothing of the project unless SYSTEM is `gns_pyg`.
+Imports nothing of the project unless SYSTEM is `gns_pyg` or `gns_pyg, bfloat16`.
 """
 
 import json
 import os
 import sys
 import time
+from functools import partial
 from pathlib import Path
 from types import ModuleType
 from typing import Any
@@ -105,7 +106,7 @@ class Torch:
         return laid_out(parts, self.order, prefix) if parts else {}
 
 
-def gns_pyg(graph: dict[str, np.ndarray]) -> Torch:
+def gns_pyg(graph: dict[str, np.ndarray], *, bfloat16: bool = False) -> Torch:
     import torch
 
     from gns_pyg.models.contact_network import ContactNetwork
@@ -113,6 +114,7 @@ def gns_pyg(graph: dict[str, np.ndarray]) -> Torch:
     class Ours(torch.nn.Module):
         def __init__(self) -> None:
             super().__init__()
+            torch.manual_seed(0)  # the same weights in either precision
             n_receiver, n_edge = graph["nodes"].shape[1], graph["edges"].shape[1]
             sizes: dict[str, Any] = {"hidden": HIDDEN, "layers": ROUNDS_OF_MESSAGES, "mlp_layers": LINEAR_LAYERS}
             self.network = ContactNetwork(
@@ -120,7 +122,8 @@ def gns_pyg(graph: dict[str, np.ndarray]) -> Torch:
             )
 
         def forward(self, nodes: Any, edges: Any, edge_index: Any) -> Any:
-            return self.network(None, nodes, edges, edge_index)
+            with torch.autocast("cpu", torch.bfloat16, enabled=bfloat16):  # as `execution.precision` does
+                return self.network(None, nodes, edges, edge_index).float()
 
     return Torch(Ours(), [], {})
 
@@ -196,7 +199,12 @@ class LagrangeBench:
         return laid_out(parts, {"message": [1, 0, 2]}, prefix)
 
 
-SYSTEMS: dict[str, Any] = {"gns_pyg": gns_pyg, "geoelements": geoelements, "LagrangeBench": LagrangeBench}
+SYSTEMS: dict[str, Any] = {
+    "gns_pyg": gns_pyg,
+    "gns_pyg, bfloat16": partial(gns_pyg, bfloat16=True),
+    "geoelements": geoelements,
+    "LagrangeBench": LagrangeBench,
+}
 
 if __name__ == "__main__":
     main(*sys.argv[1:])

@@ -3,10 +3,12 @@ r"""Full-size roll-outs against Yade on the same two cores: `python -m benchmark
 Yade runs a case of the paper's hopper and drum with two threads, at the paper's 1e-5 s and at its largest step that
 still gives the same observables (`scene.dem.dt_s=auto`); both files are kept in $GNS_DATA/rollout_benchmark. Then every
 bundle of MODELS rolls the second one out, on two threads, and is judged against it; its time is the median of three.
-Writes benchmarks/results/rollout.json. The bundles are trained on the reduced scenes first, for example
+Writes benchmarks/results/rollout.json. One row is the full-size bundle that ships; the others are trained on the
+reduced scenes first, for example
 
-    python train.py scene=hopper_small model.hidden=128 hydra.run.dir=runs/speed/hopper_128
-    python train.py scene=hopper_small model.hidden=32 model.layers=1 scene.frame_dt_s=0.02 \
+    python train.py scene=hopper_small model=contact model.hidden=128 training.updates=1500 \
+        hydra.run.dir=runs/speed/hopper_128
+    python train.py scene=hopper_small model=contact model.hidden=32 model.layers=1 scene.frame_dt_s=0.02 \
         hydra.run.dir=runs/speed/hopper_fast20
 """
 
@@ -24,20 +26,22 @@ from benchmarks.ablation import FIGURES, figures
 from data_gen.generate import generate
 from gns_pyg import machine, run
 from gns_pyg.config import CONF
-from gns_pyg.data.datamodule import open_cases
+from gns_pyg.data.datamodule import open_to_compare
 from gns_pyg.data.trajectory import Trajectory
 from gns_pyg.evaluation.predict import roll_out, start_frame
 
 OUT = Path(__file__).parent / "results" / "rollout.json"
 DATA = Path(os.environ.get("GNS_DATA", "data")) / "rollout_benchmark"
 STEPS = {"1e-5": "1e-5", "equivalent": "auto"}
-MODELS = {  # name: bundle, options
+SHIPS = "ships"
+MODELS = {  # name: folder of its run, options
     "paper's width": ("128", ()),
     "paper's width, bfloat16": ("128", ("execution.precision=bfloat16",)),
     "paper's width, frames of 20 ms": ("12820", ("scene.frame_dt_s=0.02",)),
-    "default": ("64", ()),
+    "width 64": ("64", ()),
     "fast": ("fast", ()),
     "fast, frames of 20 ms": ("fast20", ("scene.frame_dt_s=0.02",)),
+    SHIPS: ("full", ("scene.frame_dt_s=0.0025", "compare_every_s=0.01")),
 }
 CASE, THREADS, ROUNDS = 40, 2, 3
 
@@ -65,11 +69,12 @@ def yade_seconds(scene: str, name: str, step: str) -> float:
 def judged(scene: str, name: str, yade: dict[str, float]) -> dict[str, Any]:
     """One bundle on the equivalent run."""
     folder, options = MODELS[name]
-    bundle = Path("runs/speed") / f"{scene}_{folder}"
-    places = [f"bundle={bundle}/bundle", f"folder={bundle}/full_size", f"data.dir={DATA}/{scene}_equivalent"]
+    place = Path("runs/speed") / f"{scene}_{folder}"
+    bundle = f"{scene}_{folder}" if name == SHIPS else f"{place}/bundle"
+    places = [f"bundle={bundle}", f"folder={place}/full_size", f"data.dir={DATA}/{scene}_equivalent"]
     cfg = config("evaluate", *places, f"scene={scene}", *options)
     metrics, simulator = run.evaluate(cfg), run.load_bundle(cfg)
-    (case,) = open_cases(simulator.scene, cfg.data.dir)
+    case = open_to_compare(DATA / f"{scene}_equivalent" / f"case_{CASE:03d}.h5", simulator.scene, cfg.compare_every_s)
     again = [roll_out(simulator, case, start_frame(case, cfg.start_s))[1] for _ in range(ROUNDS - 1)]
     seconds = median([metrics["speed/seconds_per_simulated_second"], *again])
     row = {"model": name, "seconds_per_simulated_second": seconds}

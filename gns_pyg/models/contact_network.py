@@ -68,7 +68,7 @@ class ContactNetwork(nn.Module):
             grains, receiver = _compact(hears, receiver)
             receiver_features = receiver_features[grains]
         n_reached = len(receiver_features)
-        receivers = self.encode_receiver(recurring(receiver_features, ROWS))
+        receivers = self.encode_receiver(recurring(receiver_features, ROWS, self.hidden))
         if self.encode_sender is None or sender_features is None:
             senders = None
             sender = _compact(hears, sender)[1] if sparse else sender
@@ -76,9 +76,12 @@ class ContactNetwork(nn.Module):
             if sparse:
                 points, sender = _compact(reached(len(sender_features), sender), sender)
                 sender_features = sender_features[points]
-            senders = self.encode_sender(recurring(sender_features, ROWS))
-        sender, receiver = recurring(sender, EDGES), recurring(receiver, EDGES, value=len(receivers) - 1)
-        edges = [self.encode_edge(block) for block in blocks(recurring(edge_features, EDGES), self.hidden)]
+            senders = self.encode_sender(recurring(sender_features, ROWS, self.hidden))
+        sender, receiver = (
+            recurring(sender, EDGES, self.hidden),
+            recurring(receiver, EDGES, self.hidden, value=len(receivers) - 1),
+        )
+        edges = [self.encode_edge(block) for block in blocks(recurring(edge_features, EDGES, self.hidden), self.hidden)]
         ends = blocks(torch.stack([sender, receiver]), self.hidden, dim=1)
         for interaction in self.interactions:
             receivers, edges = interaction(receivers if senders is None else senders, receivers, edges, ends)

@@ -222,11 +222,11 @@ def pieces(contacts: Contacts, hidden: int, *, mutual: bool) -> list[Piece]:
     for ends, scalars, basis, wall_vel, share in zip(*always, *perhaps, strict=True):
         found.append(
             Piece(
-                ends=recurring(ends, ROWS).T,
-                scalars=recurring(scalars, ROWS),
-                basis=recurring(basis, ROWS).permute(1, 2, 0).contiguous(),
+                ends=recurring(ends, ROWS, hidden).T,
+                scalars=recurring(scalars, ROWS, hidden),
+                basis=recurring(basis, ROWS, hidden).permute(1, 2, 0).contiguous(),
                 slow=contacts.slow,
-                wall_vel=None if wall_vel is None else recurring(wall_vel, ROWS),
+                wall_vel=None if wall_vel is None else recurring(wall_vel, ROWS, hidden),
                 told=(torch.cat([ends, ends.flip(1)]) if mutual else ends).T,
                 share=None if share is None else share.flip(1).T.reshape(-1, 1),
             )

@@ -2,6 +2,7 @@
 
 import itertools
 from collections.abc import Callable
+from typing import Any
 
 import torch
 from torch import Tensor, nn
@@ -13,10 +14,11 @@ ONE_DNN = torch.backends.mkldnn.is_available() and hasattr(torch.ops.mkldnn, "_l
 FUSED = {torch.float32} if ONE_DNN else set()  # what oneDNN multiplies here
 if ONE_DNN and torch.ops.mkldnn._is_mkldnn_bf16_supported():
     FUSED.add(torch.bfloat16)
+WIDE = 100  # with gradients, layers from this width on gain more by oneDNN than calling it costs
 
 
 class Mlp(nn.Sequential):
-    """Linear layers with ReLU between them; without gradients on a CPU, oneDNN's own kernels."""
+    """Linear layers with ReLU between them; on a CPU oneDNN's products (see `linear`)."""
 
     def forward(self, rows: Tensor) -> Tensor:
         modules = list(self)
@@ -42,15 +44,46 @@ def mlp(n_in: int, hidden: int, n_out: int, layers: int, *, layer_norm: bool = F
 
 
 def linear(layer: nn.Linear, rows: Tensor, *, relu: bool = False) -> Tensor:
-    """`layer(rows)`, then ReLU on demand."""
+    """`layer(rows)`, then ReLU on demand. On a CPU by oneDNN, unless gradients of a narrow layer are wanted."""
     cast = torch.get_autocast_dtype("cpu") if torch.is_autocast_enabled("cpu") else layer.weight.dtype
-    if rows.device.type == "cpu" and {rows.dtype, cast} <= FUSED and not torch.is_grad_enabled():
+    if rows.device.type == "cpu" and len(rows) and {rows.dtype, cast} <= FUSED and pays(layer.out_features):
         bias = None if layer.bias is None else layer.bias.to(cast)
-        # what torch.compile would call, without compiling; not its own "relu", which makes a silent 0 of nan
-        rows = torch.ops.mkldnn._linear_pointwise(rows.to(cast), layer.weight.to(cast), bias, "none", [], "")
+        rows = product(rows.to(cast), layer.weight.to(cast), bias)
     else:
         rows = layer(rows)
     return rows.relu_() if relu else rows
+
+
+def pays(width: int) -> bool:
+    """Whether layers of this width are oneDNN's."""
+    return width >= WIDE or not torch.is_grad_enabled()
+
+
+def product(rows: Tensor, weight: Tensor, bias: Tensor | None = None) -> Tensor:
+    """rows (n, i) @ weight (o, i)^T + bias (o) by oneDNN: on AMD's processors PyTorch's own way, MKL, leaves half of
+    the vector unit idle."""
+    if torch.is_grad_enabled():
+        return Product.apply(rows, weight, bias)
+    # what torch.compile would call, without compiling; not its own "relu", which makes a silent 0 of nan
+    return torch.ops.mkldnn._linear_pointwise(rows, weight, bias, "none", [], "")
+
+
+class Product(torch.autograd.Function):
+    """`product` and its gradients, which are products too."""
+
+    @staticmethod
+    def forward(ctx: Any, rows: Tensor, weight: Tensor, bias: Tensor | None) -> Tensor:
+        ctx.save_for_backward(rows, weight)
+        return product(rows, weight, bias)
+
+    @staticmethod
+    def backward(ctx: Any, gradient: Tensor) -> tuple[Tensor | None, ...]:
+        (rows, weight), (of_rows, of_weight, of_bias) = ctx.saved_tensors, ctx.needs_input_grad
+        return (
+            product(gradient, weight.t()) if of_rows else None,
+            product(gradient.t(), rows.t()) if of_weight else None,
+            gradient.sum(0) if of_bias else None,
+        )
 
 
 def only(chosen: Tensor, function: Callable[[Tensor], Tensor], rows: Tensor) -> Tensor:
@@ -59,7 +92,7 @@ def only(chosen: Tensor, function: Callable[[Tensor], Tensor], rows: Tensor) -> 
     if rows.device.type != "cpu":
         return torch.where(chosen[:, None], function(rows), 0.0)
     named = chosen.nonzero().flatten()
-    done = function(recurring(rows.index_select(0, named), ROWS))[: len(named)]
+    done = function(recurring(rows.index_select(0, named), ROWS, rows.shape[1]))[: len(named)]
     return done.new_zeros(len(rows), done.shape[1]).index_copy(0, named, done)
 
 
@@ -68,9 +101,10 @@ def blocks(rows: Tensor, width: int, dim: int = 0) -> tuple[Tensor, ...]:
     return rows.split(max(1, BLOCK // width), dim) if rows.device.type == "cpu" else (rows,)
 
 
-def recurring(rows: Tensor, multiple: int, value: int = 0) -> Tensor:
-    """`rows` and at least one more of `value`, so that their number comes again in other steps; where it matters:
-    oneDNN builds a kernel for every new number, which takes longer than its use."""
-    if len(rows) == 0 or rows.device.type != "cpu" or torch.is_grad_enabled():
+def recurring(rows: Tensor, multiple: int, width: int, value: int = 0) -> Tensor:
+    """`rows`, on their way through layers of a width, and at least one more of `value`, so that their number comes
+    again in other steps; where it matters: oneDNN builds a kernel for every new number, which takes longer than its
+    use."""
+    if len(rows) == 0 or rows.device.type != "cpu" or not pays(width):
         return rows
     return torch.cat([rows, rows.new_full((multiple - len(rows) % multiple, *rows.shape[1:]), value)])

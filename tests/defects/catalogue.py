@@ -251,8 +251,8 @@ DEFECTS = [
     Defect(
         "nan turned to 0 in the fused path",
         "gns_pyg/models/mlp.py",
-        'layer.weight.to(cast), bias, "none", [], "")',
-        'layer.weight.to(cast), bias, "relu" if relu else "none", [], "")',
+        "layer.weight.to(cast), bias)",
+        "layer.weight.to(cast), bias).nan_to_num(0.0)",
         ("tests/models/test_contact_network.py::test_what_is_not_finite_stays_so_without_gradients",),
     ),
     Defect(
