@@ -16,10 +16,13 @@ from omegaconf import DictConfig
 
 from data_gen.continuation import continue_dem, frame_at, layout, open_case, stored_state
 from gns_pyg.config import require
-from gns_pyg.evaluation.errors import position_error, positions
+from gns_pyg.data.trajectory import Trajectory
+from gns_pyg.evaluation.errors import nanmax, nanmean, position_error, positions
 from gns_pyg.evaluation.metrics import write_json
+from gns_pyg.evaluation.observables import angle_of_repose, center_of_mass, from_frame
 from gns_pyg.evaluation.twins import twins_path
 from gns_pyg.launch import launch
+from gns_pyg.scene.scene import Scene
 
 log = logging.getLogger(__name__)
 
@@ -34,7 +37,9 @@ def twins(cfg: DictConfig) -> dict[str, Any]:
     Returns:
         `times_s` (n,); `distance_m` (pairs, n), its mean and (sample) standard deviation over pairs (n,);
         `stored_distance_m` (n,): of the run from the unshifted frame from the stored run, which kept what the stored
-        frame lacks (contact history, digits). Distances are means over grains, m.
+        frame lacks (contact history, digits). Distances are means over grains, m. `center_of_mass_max_m` (pairs,):
+        largest distance of the twins' centres of mass at any frame; `angle_of_repose_deg` (pairs,): difference of
+        their steady angles of repose, nan in a scene that has none.
 
     Raises:
         GnsError: for a case or time that does not exist, a shift out of range, Yade missing or failing.
@@ -52,11 +57,16 @@ def twins(cfg: DictConfig) -> dict[str, Any]:
     )
     start, n_frames = stored_state(trajectory, frame), trajectory.n_frames - frame
     base = continue_dem(trajectory, scene, start, n_frames)
-    curves = []
+    times_s = trajectory.times_s[frame:]
+    seen, curves, centers, angles = Seen(base, times_s, trajectory, scene), [], [], []
     for pair in range(cfg.pairs):
         generator = np.random.default_rng((scene.seed, cfg.case, pair))
         shifted = replace(start, pos=start.pos + generator.normal(0.0, sigma, start.pos.shape))
-        curves.append(position_error(continue_dem(trajectory, scene, shifted, n_frames), base))
+        pos = continue_dem(trajectory, scene, shifted, n_frames)
+        other = Seen(pos, times_s, trajectory, scene)
+        curves.append(position_error(pos, base))
+        centers.append(nanmax(np.linalg.norm(other.center_m - seen.center_m, axis=1)))
+        angles.append(abs(other.angle_deg - seen.angle_deg))
         log.info("pair %d of %d: %.4g mm apart at the end", pair + 1, cfg.pairs, 1e3 * curves[-1][-1])
     distance = np.array(curves)
     result = {
@@ -65,16 +75,34 @@ def twins(cfg: DictConfig) -> dict[str, Any]:
         "content_hash": trajectory.content_hash(),
         "start_s": float(trajectory.times_s[frame]),
         "perturbation_m": sigma,
-        "times_s": trajectory.times_s[frame:],
+        "times_s": times_s,
         "distance_m": distance,
         "mean_distance_m": distance.mean(axis=0),
         "std_distance_m": distance.std(axis=0, ddof=1) if len(distance) > 1 else np.full(n_frames, np.nan),
         "stored_distance_m": position_error(base, positions(trajectory, frame)),
+        "center_of_mass_max_m": np.array(centers),
+        "angle_of_repose_deg": np.array(angles),
     }
     path = twins_path(trajectory.path)
     write_json(path if cfg.folder is None else Path(cfg.folder) / path.name, result)
     log.info("%s\n%s", trajectory.path, table(result))
     return result
+
+
+class Seen:
+    """What one run shows: centre of mass, (n, 3) m, and steady angle of repose, degrees, nan where there is none.
+
+    Args:
+        pos: (n, n_grains, 3) m.
+        times_s: (n,) s.
+        trajectory: the case, for its grains' masses.
+        scene: its scene.
+    """
+
+    def __init__(self, pos: np.ndarray, times_s: np.ndarray, trajectory: Trajectory, scene: Scene) -> None:
+        self.center_m, self.angle_deg = center_of_mass(pos, trajectory.mass), float("nan")
+        if scene.angle_of_repose is not None:
+            self.angle_deg = nanmean(angle_of_repose(pos, scene)[from_frame(times_s, scene) :])
 
 
 def table(result: dict[str, Any]) -> str:

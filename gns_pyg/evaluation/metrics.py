@@ -232,11 +232,12 @@ def evaluate_cases(results: Sequence[CaseResult], climatology: Climatology, scen
       and the roll-out's error over it, mean over frames from 1 s on; `test/horizon_s`, `test/horizon_twin_s`: see
       `twins.horizon`. Absent unless every case has its twins.
     - `test/center_of_mass_error_max_m`: largest 3D distance over frames of the roll-out; `..._frozen_max_m`,
-      `..._climatology_max_m`: the same for the start's centre of mass and the training cases' mean curve.
+      `..._climatology_max_m`, `..._twin_max_m`: the same for the start's centre of mass, the training cases' mean curve
+      and DEM twins (absent unless every case's twins tell).
     - `test/angle_of_repose_deg`, `test/angle_of_repose_dem_deg`: time mean from `from_s` on; their
       `_standard_error_deg`: of the mean over cases, from the cases' own (block averaged) errors;
-      `test/angle_of_repose_error_deg`: absolute difference per case; `..._climatology_deg`: of the training cases'
-      mean against DEM. Absent where the scene defines no angle of repose.
+      `test/angle_of_repose_error_deg`: absolute difference per case; `..._climatology_deg`, `..._twin_deg`: of the
+      training cases' mean and of DEM twins against DEM. Absent where the scene defines no angle of repose.
     - `test/outflow_final`, `test/outflow_dem_final`: part of the grains at the start that have left at the last frame;
       `test/outflow_error_max`, `..._climatology_max`: largest difference from DEM over frames, of the roll-out and of
       the training cases' mean. Absent where the scene has no outlet.
@@ -299,6 +300,10 @@ def _evaluate_case(result: CaseResult, trivial_name: str, climatology: Climatolo
             "test/horizon_s": horizon(error, result.times_s, result.twins),
             "test/horizon_twin_s": horizon(result.twins.mean_m, result.times_s, result.twins),
         }
+        if result.twins.center_of_mass_max_m is not None:
+            metrics["test/center_of_mass_error_twin_max_m"] = result.twins.center_of_mass_max_m
+        if result.twins.angle_of_repose_deg is not None:
+            metrics["test/angle_of_repose_error_twin_deg"] = result.twins.angle_of_repose_deg
     if dem.angle_of_repose_deg is not None and model.angle_of_repose_deg is not None:
         steady = slice(from_frame(result.times_s, scene), None)
         angle, angle_error = time_mean(model.angle_of_repose_deg[steady])

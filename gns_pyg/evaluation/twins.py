@@ -17,10 +17,16 @@ class Twins:
     Attributes:
         mean_m, std_m: (n_frames,) m, mean over pairs and their standard deviation, of the mean distance of
             corresponding grains.
+        center_of_mass_max_m: largest distance of their centres of mass at any frame, m, mean over pairs; None in files
+            that do not tell.
+        angle_of_repose_deg: difference of their steady angles of repose, mean over pairs; None likewise, and in a scene
+            that has none.
     """
 
     mean_m: np.ndarray
     std_m: np.ndarray
+    center_of_mass_max_m: float | None = None
+    angle_of_repose_deg: float | None = None
 
 
 def twins_path(case: Path) -> Path:
@@ -48,7 +54,11 @@ def read_twins(case: Trajectory, times_s: np.ndarray) -> Twins | None:
         mean_m, std_m = (np.array(stored[f"{key}_distance_m"], np.float64) for key in ("mean", "std"))
         if abs(known_s[0] - times_s[0]) > 1e-6:
             return None
-        return Twins(np.interp(times_s, known_s, mean_m), np.interp(times_s, known_s, std_m))
+        told = []
+        for key in ("center_of_mass_max_m", "angle_of_repose_deg"):
+            pairs = [value for value in stored.get(key, []) if value is not None]
+            told.append(float(np.mean(pairs)) if pairs else None)
+        return Twins(np.interp(times_s, known_s, mean_m), np.interp(times_s, known_s, std_m), *told)
     except (OSError, ValueError, KeyError, TypeError, IndexError) as error:
         raise DataError(path, f"{type(error).__name__}: {error}", "what data_gen.twins writes", remedy) from None
 

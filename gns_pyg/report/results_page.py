@@ -110,6 +110,7 @@ def _rows(bundle: str, m: Mapping[str, Any], spread: Mapping[str, Any], scatter:
     step, trivial = m["test/one_step_error_m"], m["test/one_step_error_trivial_m"]
     most, center = SCORES[bundle], m["test/center_of_mass_error_max_m"]
     climatology = m["test/center_of_mass_error_climatology_max_m"]
+    twins = m.get("test/center_of_mass_error_twin_max_m")
     rows = [
         row(
             "one-step error (10 ms)",
@@ -121,7 +122,7 @@ def _rows(bundle: str, m: Mapping[str, Any], spread: Mapping[str, Any], scatter:
         row(
             "centre of mass, largest error",
             value("test/center_of_mass_error_max_m", 1e3, "mm"),
-            f"climatology {_text(climatology, 1e3)} mm",
+            f"climatology {_text(climatology, 1e3)} mm{_twins(twins, 1e3, 'mm')}",
             "at most 4 mm and 0.7 of climatology's",
             center <= min(4e-3, 0.7 * climatology),
         ),
@@ -154,7 +155,8 @@ def _rows(bundle: str, m: Mapping[str, Any], spread: Mapping[str, Any], scatter:
                 "angle of repose",
                 value("test/angle_of_repose_deg", 1.0, "degrees"),
                 f"DEM {_text(m['test/angle_of_repose_dem_deg'], 1.0)}, scatter of seeds "
-                f"{_text(scatter['angle_of_repose_deg'], 1.0)}: {off:+.1f} ± {error:.1f}",
+                f"{_text(scatter['angle_of_repose_deg'], 1.0)}"
+                f"{_twins(m.get('test/angle_of_repose_error_twin_deg'), 1.0, 'apart')}: {off:+.1f} ± {error:.1f}",
                 "within 1 degree at 95 %",
                 abs(off) + Z_95 * error <= 1.0,
             )
@@ -176,6 +178,10 @@ def _rows(bundle: str, m: Mapping[str, Any], spread: Mapping[str, Any], scatter:
         row("grains lost", str(m["test/escaped_grains"]), "", "0", m["test/escaped_grains"] == 0),
     ]
     return rows
+
+
+def _twins(value: float | None, factor: float, unit: str) -> str:
+    return "" if value is None else f", twins {_text(value, factor)} {unit}"
 
 
 def _angle(case: Mapping[str, Any], of: str) -> str:

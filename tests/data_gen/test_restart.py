@@ -137,6 +137,9 @@ class TestWithYade:
 
     def test_twins_start_a_micrometre_apart(self, rolling, tmp_path) -> None:
         result = twins(config(tmp_path, *FEW, f"data.dir={rolling}", "start_s=0.03", "pairs=1", name="twins"))
+        (apart,) = result["center_of_mass_max_m"]
+        assert 0 < apart < 1e-3
+        assert np.isnan(result["angle_of_repose_deg"]).all()  # three grains on a floor have none
         stored = json.loads((tmp_path / "twins_000.json").read_text(), parse_constant=pytest.fail)
         assert stored["times_s"] == pytest.approx([0.03, 0.04, 0.05])
         assert np.shape(stored["distance_m"]) == (1, 3)

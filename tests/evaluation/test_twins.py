@@ -51,13 +51,20 @@ def test_metrics_set_a_roll_out_beside_its_twins(tmp_path):
     scene, case = falling(tmp_path, 120)
     times_s, pos = case.times_s[10:], positions(case, 10)
     stored(
-        case, times_s=times_s.tolist(), mean_distance_m=np.linspace(0, 2e-3, 110).tolist(), std_distance_m=[0.0] * 110
+        case,
+        times_s=times_s.tolist(),
+        mean_distance_m=np.linspace(0, 2e-3, 110).tolist(),
+        std_distance_m=[0.0] * 110,
+        center_of_mass_max_m=[1e-4, 3e-4],
+        angle_of_repose_deg=[None, None],
     )
     moved = pos + np.array([1e-3, 0, 0]) * np.linspace(0, 1, 110)[:, None, None]
     result = case_result(case, scene, moved, 10, np.zeros(118), 2, 1.0)
     metrics = evaluate_cases([result], climatology([case], scene), scene).metrics
     assert metrics["test/rollout_error_final_twin_m"] == pytest.approx(2e-3)
     assert metrics["test/rollout_error_over_twin"] == pytest.approx(0.5)
+    assert metrics["test/center_of_mass_error_twin_max_m"] == pytest.approx(2e-4)
+    assert "test/angle_of_repose_error_twin_deg" not in metrics
     assert metrics["test/horizon_s"] == pytest.approx(times_s[-1] - times_s[0])
     assert metrics["test/horizon_twin_s"] == pytest.approx((times_s[-1] - times_s[0]) / 2, abs=0.011)
 
