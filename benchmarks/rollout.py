@@ -38,7 +38,6 @@ MODELS = {  # name: folder of its run, options
     "paper's width": ("128", ()),
     "paper's width, bfloat16": ("128", ("execution.precision=bfloat16",)),
     "paper's width, frames of 20 ms": ("12820", ("scene.frame_dt_s=0.02",)),
-    "width 64": ("64", ()),
     "fast": ("fast", ()),
     "fast, frames of 20 ms": ("fast20", ("scene.frame_dt_s=0.02",)),
     SHIPS: ("full", ("scene.frame_dt_s=0.0025", "compare_every_s=0.01")),
