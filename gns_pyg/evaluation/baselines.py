@@ -3,6 +3,7 @@
 A network that does not beat these has learned nothing; every error is reported beside them.
 """
 
+import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import Any
@@ -108,11 +109,13 @@ class Climatology:
         with np.errstate(invalid="ignore"):
             return (left - left[0]) / (1 - left[0])
 
-    def mean_angle_of_repose_deg(self, scene: Scene) -> float:
-        """The mean angle of repose of the training cases over the frames from `from_s` on; nan if none is defined."""
+    def mean_angle_of_repose_deg(self, scene: Scene, until_s: float = math.inf) -> float:
+        """The mean angle of repose of the training cases over the frames from `from_s` to `until_s`, where what it is
+        held against ends; nan if none is defined."""
         if self.angle_of_repose_deg is None:
             return float("nan")
-        return nanmean(self.angle_of_repose_deg[from_frame(self.times_s, scene) :])
+        stop = np.searchsorted(self.times_s, until_s + 1e-9)
+        return nanmean(self.angle_of_repose_deg[from_frame(self.times_s, scene) : stop])
 
 
 def climatology(trajectories: Sequence[Trajectory], scene: Scene) -> Climatology:

@@ -308,13 +308,14 @@ def _evaluate_case(result: CaseResult, trivial_name: str, climatology: Climatolo
         steady = slice(from_frame(result.times_s, scene), None)
         angle, angle_error = time_mean(model.angle_of_repose_deg[steady])
         dem_angle, dem_angle_error = time_mean(dem.angle_of_repose_deg[steady])
+        expected_angle = climatology.mean_angle_of_repose_deg(scene, result.times_s[-1])
         metrics |= {
             "test/angle_of_repose_deg": angle,
             "test/angle_of_repose_standard_error_deg": angle_error,
             "test/angle_of_repose_dem_deg": dem_angle,
             "test/angle_of_repose_dem_standard_error_deg": dem_angle_error,
             "test/angle_of_repose_error_deg": abs(angle - dem_angle),
-            "test/angle_of_repose_error_climatology_deg": abs(climatology.mean_angle_of_repose_deg(scene) - dem_angle),
+            "test/angle_of_repose_error_climatology_deg": abs(expected_angle - dem_angle),
         }
     if dem.outflow is not None and model.outflow is not None:
         expected_outflow = climatology.outflow_at(result.times_s)

@@ -175,7 +175,8 @@ class ImpulseRound(MessagePassing):
         slip = rel_vel - cross(spin, basis[:, :1])  # of the surfaces in touch
         along = (basis[:, :, None] * slip[:, None]).sum(0).flatten(0, 1)
         speed = (slip.square().sum(0) + SOFT).sqrt()
-        seen = torch.cat([along, speed, fine(along, contacts.slow), fine(speed, contacts.slow)]).t().contiguous()
+        seen = torch.cat([along, speed])
+        seen = torch.cat([seen, fine(seen, contacts.slow)]).t().contiguous()
         message = self.message_mlp((hidden + linear(self.from_edge, edge) + linear(self.from_seen, seen)).relu_())
         edge = edge + message
         factors = self.impulse_mlp(edge).t().contiguous().view(basis.shape[1] + 1, self.channels, len(edge))

@@ -33,10 +33,10 @@ that they have not seen. First the reduced scenes (220 to 300 grains; `make resu
 paper's at full size (`hopper_full`, `drum_full`; on cases made by the commands in [balance.md](balance.md)). How these
 bundles came about is in [experiments.md](experiments.md), [answers.md](answers.md) and [balance.md](balance.md). Means
 over unseen cases, ± the standard deviation over them; roll-outs from 0.1 s to the end, read every 10 ms. The last
-column says whether the goal that we set ourselves holds, on this scene and these cases. Twins are two DEM runs that start
-a micrometre apart: where they differ by more than a goal allows, DEM itself does not meet it. Times are of that run, whatever
-else the machine did, Yade's too (alone, it takes half as long on the full-size hopper, less than the network:
-[balance.md](balance.md)); [performance.md](performance.md) measures speed with care.
+column says whether the goal that we set ourselves holds, on this scene and these cases. Twins are two DEM runs that
+start a micrometre apart: where they differ by more than a goal allows, DEM itself does not meet it. Times are of that
+run, whatever else the machine did, Yade's too (alone, it takes half as long on the full-size hopper, less than the
+network: [balance.md](balance.md)); [performance.md](performance.md) measures speed with care.
 """
 
 

@@ -1,5 +1,7 @@
 """Trivial predictors and climatology on runs whose answer is known."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
@@ -48,6 +50,16 @@ def test_climatology_of_identical_cases_is_the_case(tmp_path):
     truth = expected.center_of_mass_m
     assert expected.center_of_mass_error_m(training[0].times_s, truth) == 0.0
     assert expected.mean_angle_of_repose_deg(scene) == pytest.approx(25.0, abs=0.5)
+
+
+def test_the_expected_angle_ends_where_the_roll_out_does(tmp_path):
+    scene = scenes.heap_case(tmp_path / "a.h5", "plane", angle_deg=25.0)
+    expected = climatology([Trajectory(tmp_path / "a.h5")], scene)
+    flatter_later = np.where(expected.times_s > expected.times_s[2], 10.0, 30.0)
+    longer = replace(expected, angle_of_repose_deg=flatter_later)
+    from_start = replace(scene, angle_of_repose=replace(scene.angle_of_repose, from_s=0.0))
+    assert longer.mean_angle_of_repose_deg(from_start, expected.times_s[2]) == pytest.approx(30.0)
+    assert longer.mean_angle_of_repose_deg(from_start) < 30.0
 
 
 def test_climatology_is_the_mean_and_is_held_past_its_end(tmp_path):
