@@ -16,10 +16,9 @@ from omegaconf import DictConfig
 
 from data_gen.continuation import continue_dem, frame_at, layout, open_case, stored_state
 from gns_pyg.config import require
-from gns_pyg.data.trajectory import Trajectory
-from gns_pyg.evaluation.errors import nanmax, nanmean, position_error, positions
+from gns_pyg.evaluation.errors import nanmax, position_error, positions
 from gns_pyg.evaluation.metrics import write_json
-from gns_pyg.evaluation.observables import angle_of_repose, center_of_mass, from_frame
+from gns_pyg.evaluation.observables import center_of_mass, mean_angle_of_repose
 from gns_pyg.evaluation.twins import twins_path
 from gns_pyg.launch import launch
 from gns_pyg.scene.scene import Scene
@@ -58,15 +57,15 @@ def twins(cfg: DictConfig) -> dict[str, Any]:
     start, n_frames = stored_state(trajectory, frame), trajectory.n_frames - frame
     base = continue_dem(trajectory, scene, start, n_frames)
     times_s = trajectory.times_s[frame:]
-    seen, curves, centers, angles = Seen(base, times_s, trajectory, scene), [], [], []
+    center, angle = center_of_mass(base, trajectory.mass), steady_angle(base, times_s, scene)
+    curves, centers, angles = [], [], []
     for pair in range(cfg.pairs):
         generator = np.random.default_rng((scene.seed, cfg.case, pair))
         shifted = replace(start, pos=start.pos + generator.normal(0.0, sigma, start.pos.shape))
         pos = continue_dem(trajectory, scene, shifted, n_frames)
-        other = Seen(pos, times_s, trajectory, scene)
         curves.append(position_error(pos, base))
-        centers.append(nanmax(np.linalg.norm(other.center_m - seen.center_m, axis=1)))
-        angles.append(abs(other.angle_deg - seen.angle_deg))
+        centers.append(nanmax(np.linalg.norm(center_of_mass(pos, trajectory.mass) - center, axis=1)))
+        angles.append(abs(steady_angle(pos, times_s, scene) - angle))
         log.info("pair %d of %d: %.4g mm apart at the end", pair + 1, cfg.pairs, 1e3 * curves[-1][-1])
     distance = np.array(curves)
     result = {
@@ -89,20 +88,9 @@ def twins(cfg: DictConfig) -> dict[str, Any]:
     return result
 
 
-class Seen:
-    """What one run shows: centre of mass, (n, 3) m, and steady angle of repose, degrees, nan where there is none.
-
-    Args:
-        pos: (n, n_grains, 3) m.
-        times_s: (n,) s.
-        trajectory: the case, for its grains' masses.
-        scene: its scene.
-    """
-
-    def __init__(self, pos: np.ndarray, times_s: np.ndarray, trajectory: Trajectory, scene: Scene) -> None:
-        self.center_m, self.angle_deg = center_of_mass(pos, trajectory.mass), float("nan")
-        if scene.angle_of_repose is not None:
-            self.angle_deg = nanmean(angle_of_repose(pos, scene)[from_frame(times_s, scene) :])
+def steady_angle(pos: np.ndarray, times_s: np.ndarray, scene: Scene) -> float:
+    """`mean_angle_of_repose`, degrees; nan in a scene that has none."""
+    return float("nan") if scene.angle_of_repose is None else mean_angle_of_repose(pos, times_s, scene)[0]
 
 
 def table(result: dict[str, Any]) -> str:

@@ -157,7 +157,7 @@ class ImpulseRound(MessagePassing):
         vel, spin = (part.view(grains.vel.shape) for part in gained[:, heard:].chunk(2, dim=1))
         there = grains.latent
         if self.update_mlp is not None:  # of those that hear: a network that reaches nobody changes nothing
-            there = there + only(hears, self.update_mlp, torch.cat([there, gained[:, :heard]], dim=1))
+            there = there + only(hears, self.update_mlp, torch.cat([there, gained[:, :heard]], dim=1), self.hidden)
         return Grains(there, grains.vel + vel, grains.spin + spin), after
 
     def edge_update(

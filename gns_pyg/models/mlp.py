@@ -86,13 +86,13 @@ class Product(torch.autograd.Function):
         )
 
 
-def only(chosen: Tensor, function: Callable[[Tensor], Tensor], rows: Tensor) -> Tensor:
-    """`function(rows)` where `chosen`, (n,), else 0. A CPU computes no others; on a GPU numbers of rows stay as they
-    are."""
+def only(chosen: Tensor, function: Callable[[Tensor], Tensor], rows: Tensor, width: int) -> Tensor:
+    """`function(rows)`, of layers of a width, where `chosen`, (n,), else 0. A CPU computes no others; on a GPU numbers
+    of rows stay as they are."""
     if rows.device.type != "cpu":
         return torch.where(chosen[:, None], function(rows), 0.0)
     named = chosen.nonzero().flatten()
-    done = function(recurring(rows.index_select(0, named), ROWS, rows.shape[1]))[: len(named)]
+    done = function(recurring(rows.index_select(0, named), ROWS, width))[: len(named)]
     return done.new_zeros(len(rows), done.shape[1]).index_copy(0, named, done)
 
 
