@@ -72,6 +72,7 @@ def share(rank, port, region, path):
     trained = DistributedDataParallel(module(rank, region))
     trained(range(2 * rank, 2 * rank + 2)).backward()
     torch.save([parameter.grad for parameter in trained.parameters()], f"{path}/{rank}.pt")
+    del trained  # a reducer that outlives the group joins the group's threads while it holds the lock they wait for
     distributed.destroy_process_group()
 
 
@@ -82,7 +83,9 @@ def test_gradients_of_two_processes_are_those_of_one_on_the_union(region, tmp_pa
     with socket.socket() as free:
         free.bind(("127.0.0.1", 0))
         port = free.getsockname()[1]
-    multiprocessing.spawn(share, (port, region, str(tmp_path)), nprocs=2)
+    both = multiprocessing.spawn(share, (port, region, str(tmp_path)), nprocs=2, join=False, daemon=True)
+    both.join(100)  # returns when the first ends
+    assert both.join(100), "a process hangs"
     expected = [parameter.grad for parameter in alone.parameters()]
     assert max(float(gradient.abs().max()) for gradient in expected) > 1e-3
     for rank in range(2):
