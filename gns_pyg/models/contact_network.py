@@ -5,7 +5,7 @@ from jaxtyping import Bool, Float, Int
 from torch import Tensor, nn
 
 from gns_pyg.models.interaction import Interaction
-from gns_pyg.models.mlp import ROWS, blocks, mlp, recurring
+from gns_pyg.models.mlp import ROWS, Mlp, blocks, mlp, recurring
 from gns_pyg.state import reached
 
 EDGES = 512  # edges come in multiples of it
@@ -41,12 +41,14 @@ class ContactNetwork(nn.Module):
         super().__init__()
         self.n_out, self.hidden, self.sparse = n_out, hidden, sparse
 
-        def encoder(n_in: int) -> nn.Module:
+        def encoder(n_in: int) -> Mlp:
             return mlp(n_in, hidden, hidden, mlp_layers, layer_norm=skip)
 
         self.encode_sender = None if n_sender is None else encoder(n_sender)
         self.encode_receiver, self.encode_edge = encoder(n_receiver), encoder(n_edge)
-        self.interactions = nn.ModuleList(Interaction(hidden, mlp_layers, skip=skip) for _ in range(layers))
+        self.interactions = nn.ModuleList(
+            Interaction(hidden, mlp_layers, skip=skip, last=turn == layers - 1) for turn in range(layers)
+        )
         self.decode = mlp(hidden, hidden, n_out, mlp_layers)
 
     def forward(
@@ -81,10 +83,15 @@ class ContactNetwork(nn.Module):
             recurring(sender, EDGES, self.hidden),
             recurring(receiver, EDGES, self.hidden, value=len(receivers) - 1),
         )
-        edges = [self.encode_edge(block) for block in blocks(recurring(edge_features, EDGES, self.hidden), self.hidden)]
-        ends = blocks(torch.stack([sender, receiver]), self.hidden, dim=1)
+        encode, affine = self.encode_edge.parted(edge_features.dtype)
+        edges = [encode(block) for block in blocks(recurring(edge_features, EDGES, self.hidden), self.hidden)]
+        ends, lacking = torch.stack([sender, receiver]), None
+        if affine is not None:
+            weight, lacking = affine
+            edges = [edge.mul_(weight) for edge in edges]
         for interaction in self.interactions:
-            receivers, edges = interaction(receivers if senders is None else senders, receivers, edges, ends)
+            senders_ = receivers if senders is None else senders
+            receivers, edges, lacking = interaction(senders_, receivers, edges, ends, lacking)
         effect = self.decode(receivers)[:n_reached]
         if sparse:
             return effect.new_zeros(n_receivers, self.n_out).index_copy(0, grains, effect)

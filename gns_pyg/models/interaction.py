@@ -1,13 +1,14 @@
 """One round of message passing: the paper's equations (7) and (8)."""
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 
 import torch
 from jaxtyping import Float, Int
 from torch import Tensor, nn
+from torch.nn.functional import embedding_bag
 from torch_geometric.nn import MessagePassing
 
-from gns_pyg.models.mlp import linear, mlp
+from gns_pyg.models.mlp import blocks, dense, linear, mlp
 
 
 class Interaction(MessagePassing):
@@ -20,18 +21,22 @@ class Interaction(MessagePassing):
         hidden: width of all latents.
         mlp_layers: linear layers of each MLP.
         skip: adds each MLP's input latent to its output and normalises its layers (not in the paper).
+        last: no later round would read the edges' latents.
 
     Edges come in blocks (see `mlp.blocks`). One block takes PyG's own way; several go one after the other through all
-    layers while they are in the processor's cache, with the same result.
+    layers while they are in the processor's cache, with the same result. So does a CPU's one block without gradients,
+    where layer norms are parted (see `Mlp.parted`): their weights are applied to the sums of messages, and their biases
+    are left out of the edges' latents, which they overwrite, and of which only a product is taken.
 
     Shapes:
-        senders (n_senders, hidden), receivers (n_receivers, hidden), edges n_blocks x (n, hidden) ->
-        receivers (n_receivers, hidden), edges n_blocks x (n, hidden)
+        senders (n_senders, hidden), receivers (n_receivers, hidden), edges n_blocks x (n, hidden), ends (2, n_edges),
+        lacking (hidden), what every edge's latent lacks, or None ->
+        receivers (n_receivers, hidden), edges n_blocks x (n, hidden), lacking
     """
 
-    def __init__(self, hidden: int, mlp_layers: int, *, skip: bool) -> None:
+    def __init__(self, hidden: int, mlp_layers: int, *, skip: bool, last: bool = False) -> None:
         super().__init__(aggr="sum", flow="source_to_target")
-        self.skip = skip
+        self.skip, self.last = skip, last
         self.from_receiver = nn.Linear(hidden, hidden)
         self.from_sender = nn.Linear(hidden, hidden, bias=False)
         self.from_edge = nn.Linear(hidden, hidden, bias=False)
@@ -45,23 +50,52 @@ class Interaction(MessagePassing):
         senders: Float[Tensor, "n_senders hidden"],
         receivers: Float[Tensor, "n_receivers hidden"],
         edges: Sequence[Float[Tensor, "_ hidden"]],
-        edge_index: Sequence[Int[Tensor, "2 _"]],
-    ) -> tuple[Float[Tensor, "n_receivers hidden"], list[Float[Tensor, "_ hidden"]]]:
-        size = (senders.shape[0], receivers.shape[0])
-        nodes = (linear(self.from_sender, senders), linear(self.from_receiver, receivers))
-        if len(edges) == 1:
-            messages = self.edge_updater(edge_index[0], x=nodes, edge=linear(self.from_edge, edges[0]), size=size)
-            received = self.propagate(edge_index[0], messages=messages, size=size)
+        ends: Int[Tensor, "2 _"],
+        lacking: Float[Tensor, " hidden"] | None = None,
+    ) -> tuple[Float[Tensor, "n_receivers hidden"], list[Float[Tensor, "_ hidden"]], Float[Tensor, " hidden"] | None]:
+        function, affine = self.message_mlp.parted(receivers.dtype)
+        if len(edges) == 1 and affine is None:
+            size = (senders.shape[0], receivers.shape[0])
+            nodes = (linear(self.from_sender, senders), linear(self.from_receiver, receivers))
+            messages = self.edge_updater(ends, x=nodes, edge=linear(self.from_edge, edges[0]), size=size)
+            received = self.propagate(ends, messages=messages, size=size)
             after = [edges[0] + messages if self.skip else messages]
         else:
-            received, after = torch.zeros_like(receivers), []
-            for edge, (sender, receiver) in zip(edges, edge_index, strict=True):
-                ends = nodes[0].index_select(0, sender), nodes[1].index_select(0, receiver)
-                messages = self.edge_update(*ends, linear(self.from_edge, edge))
+            received, after, wide = torch.zeros_like(receivers), [], receivers.shape[1]
+            of_ends, constant = self._of_ends(senders, receivers, ends), None
+            if lacking is not None:
+                constant = self.from_edge.weight @ lacking
+            for edge, latent, receiver in zip(edges, of_ends, blocks(ends[1], wide), strict=True):
+                messages = function(latent.add_(dense(edge, self.from_edge.weight, constant)).relu_())
                 received.index_add_(0, receiver, messages.to(received.dtype))  # sums stay in full precision
-                after.append(edge + messages if self.skip else messages)
+                if self.skip and not self.last:
+                    messages = edge + messages if affine is None else edge.addcmul_(messages, affine[0])
+                after.append(messages)
+            if affine is not None:
+                weight, bias = affine
+                degree = torch.bincount(ends[1], minlength=len(receivers)).to(received.dtype)
+                received = received.mul_(weight).addcmul_(degree[:, None], bias)
+                lacking = bias if lacking is None else lacking + bias
         updated = self.update_mlp(torch.cat([receivers, received], dim=1))
-        return receivers + updated if self.skip else updated, after
+        return receivers + updated if self.skip else updated, after, lacking
+
+    def _of_ends(self, senders: Tensor, receivers: Tensor, ends: Tensor) -> Iterator[Tensor]:
+        """The products with every edge's sender and receiver, summed, block by block."""
+        of_sender, of_receiver, wide = self.from_sender, self.from_receiver, receivers.shape[1]
+        if torch.is_grad_enabled():
+            nodes = linear(of_receiver, receivers), linear(of_sender, senders)
+            for sender, receiver in blocks(ends, wide, 1):
+                yield nodes[0].index_select(0, receiver) + nodes[1].index_select(0, sender)
+            return
+        if senders is receivers:  # both products at once, and both rows of an edge in one go
+            weight = torch.cat([of_receiver.weight, of_sender.weight])
+            bias = torch.cat([of_receiver.bias, torch.zeros_like(of_receiver.bias)])
+            table, rows = dense(receivers, weight, bias).view(-1, wide), torch.stack([2 * ends[1], 2 * ends[0] + 1], 1)
+        else:
+            table = torch.cat([linear(of_receiver, receivers), linear(of_sender, senders)])
+            rows = torch.stack([ends[1], ends[0] + len(receivers)], 1)
+        for both in blocks(rows, wide):
+            yield embedding_bag(both, table, mode="sum")
 
     def edge_update(self, x_j: Tensor, x_i: Tensor, edge: Tensor) -> Tensor:
         return self.message_mlp((x_i + x_j).add_(edge).relu_())

@@ -5,7 +5,7 @@ import torch
 
 from gns_pyg.models.contact_network import EDGES, ContactNetwork
 from gns_pyg.models.interaction import Interaction
-from gns_pyg.models.mlp import ROWS, linear
+from gns_pyg.models.mlp import ONE_DNN, ROWS, dense
 
 WIDTH = 8
 
@@ -22,7 +22,7 @@ def test_split_first_layer_is_the_layer_on_the_concatenation():
     messages = block.message_mlp(torch.relu(joined @ weight.T + block.from_receiver.bias))
     received = torch.stack([messages[edge_index[1] == i].sum(0) for i in range(5)])
     expected = block.update_mlp(torch.cat([receivers, received], dim=1))
-    updated, kept = block(senders, receivers, [edges], [edge_index])
+    updated, kept, _ = block(senders, receivers, [edges], edge_index)
     assert torch.allclose(updated, expected)
     assert torch.allclose(kept[0], messages)
 
@@ -93,9 +93,9 @@ def test_edges_in_blocks_are_the_plain_network_with_the_same_gradients(skip, n_s
 def test_without_gradients_layers_see_the_same_numbers_of_rows_at_every_step(n_sender, monkeypatch):
     model, seen, random = network(n_sender=n_sender), set(), torch.Generator().manual_seed(1)
 
-    def spied(layer, rows, **options):
+    def spied(rows, *layer):
         seen.add(len(rows))
-        return linear(layer, rows, **options)
+        return dense(rows, *layer)
 
     for n in (20, 31, 57, 256):
         senders = None if n_sender is None else torch.randn(n, 4, generator=random)
@@ -105,10 +105,31 @@ def test_without_gradients_layers_see_the_same_numbers_of_rows_at_every_step(n_s
         expected = model(senders, grains, edges, edge_index).detach()
         with monkeypatch.context() as patch, torch.inference_mode():
             for module in ("mlp", "interaction"):
-                patch.setattr(f"gns_pyg.models.{module}.linear", spied)
+                patch.setattr(f"gns_pyg.models.{module}.dense", spied)
             found = model(senders, grains, edges, edge_index)
         assert torch.allclose(found, expected, rtol=1e-5, atol=1e-5 * float(expected.abs().max()))
     assert seen <= {ROWS, 2 * ROWS, 3 * ROWS, EDGES, 4 * EDGES}
+
+
+@pytest.mark.parametrize("n_blocks", [1, 5])
+@pytest.mark.parametrize("n_sender", [None, 4])
+def test_parted_layer_norms_give_what_whole_ones_give(n_sender, n_blocks, monkeypatch):
+    """The formula without gradients beside that with gradients, which layer norms of their own weights tell apart."""
+    model, random = network(n_sender=n_sender, layers=3), torch.Generator().manual_seed(1)
+    with torch.no_grad():
+        for module in model.modules():
+            if isinstance(module, torch.nn.LayerNorm):
+                module.weight.add_(torch.randn(WIDTH, generator=random))
+                module.bias.add_(torch.randn(WIDTH, generator=random))
+    senders, grains = torch.randn(50, 4, generator=random), torch.randn(60, 3, generator=random)
+    edges, pairs = torch.randn(400, 2, generator=random), torch.randint(0, 50, (2, 200), generator=random)
+    inputs = None if n_sender is None else senders, grains, edges, torch.cat([pairs, pairs.flip(0)], dim=1)
+    monkeypatch.setattr("gns_pyg.models.mlp.BLOCK", -(-EDGES // n_blocks) * WIDTH)
+    expected = model(*inputs).detach()
+    with torch.inference_mode():
+        found = model(*inputs)
+    assert torch.allclose(found, expected, rtol=1e-5, atol=1e-5 * float(expected.abs().max()))
+    assert not ONE_DNN or not torch.equal(found, expected)  # they are two ways
 
 
 @pytest.mark.parametrize("n_sender", [None, 4])

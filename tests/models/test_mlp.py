@@ -18,7 +18,7 @@ def test_a_wide_layer_and_its_gradients_are_pytorchs(n: int, n_in: int, n_out: i
 
     def found(own: bool) -> list[torch.Tensor]:
         given = rows.clone().requires_grad_()
-        out = linear(layer, given, relu=True) if own else layer(given).relu()
+        out = linear(layer, given).relu_() if own else layer(given).relu()
         assert not own or n == 0 or "Product" in str(out.grad_fn.next_functions)
         return [out, *torch.autograd.grad((out * weights).sum(), [given, *layer.parameters()])]
 
@@ -41,7 +41,7 @@ def test_a_wide_layers_gradients_have_gradients() -> None:
 def test_a_number_that_is_none_stays_none_through_relu(grad: bool) -> None:
     layer, rows = nn.Linear(WIDE, WIDE), torch.full((3, WIDE), torch.nan)
     with torch.set_grad_enabled(grad):
-        assert linear(layer, rows, relu=True).isnan().all()
+        assert linear(layer, rows).relu_().isnan().all()
 
 
 @pytest.mark.parametrize(("grad", "width", "filled"), [(False, 8, 128), (True, WIDE, 128), (True, WIDE - 1, 100)])
