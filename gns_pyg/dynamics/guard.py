@@ -177,7 +177,7 @@ class PartGuard(nn.Module):
         self, start: Float[Tensor, "n 3"], end: Float[Tensor, "n 3"]
     ) -> tuple[Int[Tensor, " m"], Int[Tensor, " m"], Float[Tensor, " m"]]:
         """Every meeting of a line with a triangle: line, plane, and after which part of the line."""
-        above, below = (at @ self.normal.T - self.offset for at in (start, end))
+        above, below = (torch.addmm(-self.offset, at, self.normal.T) for at in (start, end))
         comes = above >= -self.tolerance_m
         line, plane = (comes & (below < self.tolerance_m) & (below < above)).nonzero().unbind(1)
         height, depth = above[line, plane].clamp(min=0), below[line, plane]

@@ -14,6 +14,7 @@ from functools import lru_cache
 from importlib.util import find_spec
 from math import inf, nextafter
 
+import numpy as np
 import torch
 from jaxtyping import Float, Int
 from scipy.spatial import cKDTree
@@ -78,13 +79,21 @@ def _key(query: Tensor, point: Tensor, n_points: int) -> Tensor:
 
 def _edges(key: Tensor, n_points: int) -> Tensor:
     """Sorted [point, query] of keys."""
-    key, bits = key.sort().values, n_points.bit_length()
+    return _ends(key.sort().values, n_points)
+
+
+def _ends(key: Tensor, n_points: int) -> Tensor:
+    bits = n_points.bit_length()
     return torch.stack([key & (1 << bits) - 1, key >> bits])
 
 
 def _kdtree(points: Tensor, point_batch: Tensor) -> Index:
     """SciPy's k-d tree, one per graph."""
     rows = _rows_per_graph(point_batch)
+
+    def edges(keys: list[Tensor]) -> Tensor:  # NumPy sorts integers in a tenth of PyTorch's time
+        return _ends(torch.from_numpy(np.sort(torch.cat(keys).numpy())), len(points))
+
     trees = {graph: cKDTree(points[where].numpy(), balanced_tree=False) for graph, where in rows.items()}
 
     def index(query: Tensor, query_batch: Tensor, radius: float) -> Tensor:
@@ -94,14 +103,14 @@ def _kdtree(points: Tensor, point_batch: Tensor) -> Index:
                 half = torch.from_numpy(trees[graph].query_pairs(radius, output_type="ndarray"))
                 one, other = where[half.T]
                 found += [_key(one, other, len(points)), _key(other, one, len(points)), _key(where, where, len(points))]
-            return _edges(torch.cat(found), len(points))
+            return edges(found)
         for graph, where in _rows_per_graph(query_batch).items():
             if graph in trees:
                 asking = cKDTree(query[where].numpy(), balanced_tree=False)
                 near = trees[graph].sparse_distance_matrix(asking, radius, output_type="ndarray")
                 point, row = (torch.from_numpy(near[end].copy()) for end in "ij")
                 found.append(_key(where[row], rows[graph][point], len(points)))
-        return _edges(torch.cat(found), len(points))
+        return edges(found)
 
     return index
 

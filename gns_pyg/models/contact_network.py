@@ -4,7 +4,7 @@ import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor, nn
 
-from gns_pyg.models.interaction import Interaction
+from gns_pyg.models.interaction import Ends, Interaction
 from gns_pyg.models.mlp import ROWS, Mlp, blocks, mlp, recurring
 from gns_pyg.state import reached
 
@@ -85,7 +85,7 @@ class ContactNetwork(nn.Module):
         )
         encode, affine = self.encode_edge.parted(edge_features.dtype)
         edges = [encode(block) for block in blocks(recurring(edge_features, EDGES, self.hidden), self.hidden)]
-        ends, lacking = torch.stack([sender, receiver]), None
+        ends, lacking = Ends(sender, receiver, len(receivers), same=senders is None), None
         if affine is not None:
             weight, lacking = affine
             edges = [edge.mul_(weight) for edge in edges]

@@ -1,6 +1,7 @@
 """One round of message passing: the paper's equations (7) and (8)."""
 
 from collections.abc import Iterator, Sequence
+from functools import cached_property
 
 import torch
 from jaxtyping import Float, Int
@@ -9,6 +10,33 @@ from torch.nn.functional import embedding_bag
 from torch_geometric.nn import MessagePassing
 
 from gns_pyg.models.mlp import blocks, dense, linear, mlp
+
+
+class Ends:
+    """Who is at the ends of every edge, and what every round needs to know of it.
+
+    Args:
+        sender, receiver: rows of the senders and of the receivers, (n_edges).
+        n_receivers: how many there are.
+        same: senders are the receivers.
+    """
+
+    def __init__(self, sender: Int[Tensor, " _"], receiver: Int[Tensor, " _"], n_receivers: int, *, same: bool) -> None:
+        self.index = torch.stack([sender, receiver])
+        self.n_receivers, self.same = n_receivers, same
+
+    @cached_property
+    def rows(self) -> Int[Tensor, "_ 2"]:
+        """Of both ends in a table of products: of each receiver's, if it sends too, as both; else of all receivers
+        before all senders."""
+        sender, receiver = self.index
+        rows = (2 * receiver, 2 * sender + 1) if self.same else (receiver, sender + self.n_receivers)
+        return torch.stack(rows, 1)
+
+    @cached_property
+    def degree(self) -> Int[Tensor, "n_receivers 1"]:
+        """How many edges reach each receiver."""
+        return torch.bincount(self.index[1], minlength=self.n_receivers)[:, None]
 
 
 class Interaction(MessagePassing):
@@ -29,7 +57,7 @@ class Interaction(MessagePassing):
     are left out of the edges' latents, which they overwrite, and of which only a product is taken.
 
     Shapes:
-        senders (n_senders, hidden), receivers (n_receivers, hidden), edges n_blocks x (n, hidden), ends (2, n_edges),
+        senders (n_senders, hidden), receivers (n_receivers, hidden), edges n_blocks x (n, hidden), ends (of n_edges),
         lacking (hidden), what every edge's latent lacks, or None ->
         receivers (n_receivers, hidden), edges n_blocks x (n, hidden), lacking
     """
@@ -50,22 +78,22 @@ class Interaction(MessagePassing):
         senders: Float[Tensor, "n_senders hidden"],
         receivers: Float[Tensor, "n_receivers hidden"],
         edges: Sequence[Float[Tensor, "_ hidden"]],
-        ends: Int[Tensor, "2 _"],
+        ends: Ends,
         lacking: Float[Tensor, " hidden"] | None = None,
     ) -> tuple[Float[Tensor, "n_receivers hidden"], list[Float[Tensor, "_ hidden"]], Float[Tensor, " hidden"] | None]:
         function, affine = self.message_mlp.parted(receivers.dtype)
         if len(edges) == 1 and affine is None:
             size = (senders.shape[0], receivers.shape[0])
             nodes = (linear(self.from_sender, senders), linear(self.from_receiver, receivers))
-            messages = self.edge_updater(ends, x=nodes, edge=linear(self.from_edge, edges[0]), size=size)
-            received = self.propagate(ends, messages=messages, size=size)
+            messages = self.edge_updater(ends.index, x=nodes, edge=linear(self.from_edge, edges[0]), size=size)
+            received = self.propagate(ends.index, messages=messages, size=size)
             after = [edges[0] + messages if self.skip else messages]
         else:
             received, after, wide = torch.zeros_like(receivers), [], receivers.shape[1]
             of_ends, constant = self._of_ends(senders, receivers, ends), None
             if lacking is not None:
                 constant = self.from_edge.weight @ lacking
-            for edge, latent, receiver in zip(edges, of_ends, blocks(ends[1], wide), strict=True):
+            for edge, latent, receiver in zip(edges, of_ends, blocks(ends.index[1], wide), strict=True):
                 messages = function(latent.add_(dense(edge, self.from_edge.weight, constant)).relu_())
                 received.index_add_(0, receiver, messages.to(received.dtype))  # sums stay in full precision
                 if self.skip and not self.last:
@@ -73,28 +101,26 @@ class Interaction(MessagePassing):
                 after.append(messages)
             if affine is not None:
                 weight, bias = affine
-                degree = torch.bincount(ends[1], minlength=len(receivers)).to(received.dtype)
-                received = received.mul_(weight).addcmul_(degree[:, None], bias)
+                received = received.mul_(weight).addcmul_(ends.degree, bias)
                 lacking = bias if lacking is None else lacking + bias
         updated = self.update_mlp(torch.cat([receivers, received], dim=1))
         return receivers + updated if self.skip else updated, after, lacking
 
-    def _of_ends(self, senders: Tensor, receivers: Tensor, ends: Tensor) -> Iterator[Tensor]:
+    def _of_ends(self, senders: Tensor, receivers: Tensor, ends: Ends) -> Iterator[Tensor]:
         """The products with every edge's sender and receiver, summed, block by block."""
         of_sender, of_receiver, wide = self.from_sender, self.from_receiver, receivers.shape[1]
         if torch.is_grad_enabled():
             nodes = linear(of_receiver, receivers), linear(of_sender, senders)
-            for sender, receiver in blocks(ends, wide, 1):
+            for sender, receiver in blocks(ends.index, wide, 1):
                 yield nodes[0].index_select(0, receiver) + nodes[1].index_select(0, sender)
             return
-        if senders is receivers:  # both products at once, and both rows of an edge in one go
+        if ends.same:  # both products at once, and both rows of an edge in one go
             weight = torch.cat([of_receiver.weight, of_sender.weight])
             bias = torch.cat([of_receiver.bias, torch.zeros_like(of_receiver.bias)])
-            table, rows = dense(receivers, weight, bias).view(-1, wide), torch.stack([2 * ends[1], 2 * ends[0] + 1], 1)
+            table = dense(receivers, weight, bias).view(-1, wide)
         else:
             table = torch.cat([linear(of_receiver, receivers), linear(of_sender, senders)])
-            rows = torch.stack([ends[1], ends[0] + len(receivers)], 1)
-        for both in blocks(rows, wide):
+        for both in blocks(ends.rows, wide):
             yield embedding_bag(both, table, mode="sum")
 
     def edge_update(self, x_j: Tensor, x_i: Tensor, edge: Tensor) -> Tensor:

@@ -8,7 +8,7 @@ import torch
 from torch import Tensor, nn
 
 ROWS = 128  # of which rows come in multiples (see `recurring`)
-BLOCK = 3 * 2**17  # numbers of a latent that a CPU handles at once: few enough to stay in its cache through all layers
+BLOCK = 3 * 2**17  # numbers of a latent that each thread of a CPU handles at once: few enough to stay in its cache
 
 ONE_DNN = torch.backends.mkldnn.is_available() and hasattr(torch.ops.mkldnn, "_linear_pointwise")
 FUSED = {torch.float32} if ONE_DNN else set()  # what oneDNN multiplies here
@@ -38,10 +38,12 @@ class Mlp(nn.Sequential):
         if isinstance(norm, nn.LayerNorm) and multiplied == dtype == weight.dtype:
             weight, bias, affine = weight - weight.mean(0), bias - bias.mean(), (norm.weight, norm.bias)
 
+        multiply = dense if affine is None else product
+
         def function(rows: Tensor) -> Tensor:
             for layer in layers[:-1]:
-                rows = linear(layer, rows).relu_()
-            rows = dense(rows, weight, bias)
+                rows = multiply(rows, layer.weight, layer.bias).relu_()
+            rows = multiply(rows, weight, bias)
             if not isinstance(norm, nn.LayerNorm):
                 return rows
             if affine is None:
@@ -73,7 +75,7 @@ def linear(layer: nn.Linear, rows: Tensor) -> Tensor:
 def dense(rows: Tensor, weight: Tensor, bias: Tensor | None = None) -> Tensor:
     """rows (n, i) @ weight (o, i)^T + bias (o). On a CPU by oneDNN, unless gradients of a narrow layer are wanted."""
     cast = fuses(weight, rows.dtype)
-    if cast is None or len(rows) == 0:
+    if cast is None or rows.shape[0] == 0:
         return nn.functional.linear(rows, weight, bias)
     return product(rows.to(cast), weight.to(cast), None if bias is None else bias.to(cast))
 
@@ -128,7 +130,7 @@ def only(chosen: Tensor, function: Callable[[Tensor], Tensor], rows: Tensor, wid
 
 def blocks(rows: Tensor, width: int, dim: int = 0) -> tuple[Tensor, ...]:
     """`rows` in pieces that are best handled one after the other at this width; a GPU takes all at once."""
-    return rows.split(max(1, BLOCK // width), dim) if rows.device.type == "cpu" else (rows,)
+    return rows.split(max(1, torch.get_num_threads() * BLOCK // width), dim) if rows.device.type == "cpu" else (rows,)
 
 
 def recurring(rows: Tensor, multiple: int, width: int, value: int = 0) -> Tensor:

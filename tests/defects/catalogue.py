@@ -100,8 +100,8 @@ DEFECTS = [
     Defect(
         "missing size= where messages are summed",
         "gns_pyg/models/interaction.py",
-        "self.propagate(ends, messages=messages, size=size)",
-        "self.propagate(ends, messages=messages)",
+        "self.propagate(ends.index, messages=messages, size=size)",
+        "self.propagate(ends.index, messages=messages)",
         (
             "tests/models/test_contact_network.py::test_computing_all_grains_gives_what_computing_the_reached_ones_gives",
         ),

@@ -4,7 +4,7 @@ import pytest
 import torch
 
 from gns_pyg.models.contact_network import EDGES, ContactNetwork
-from gns_pyg.models.interaction import Interaction
+from gns_pyg.models.interaction import Ends, Interaction
 from gns_pyg.models.mlp import ONE_DNN, ROWS, dense
 
 WIDTH = 8
@@ -22,7 +22,7 @@ def test_split_first_layer_is_the_layer_on_the_concatenation():
     messages = block.message_mlp(torch.relu(joined @ weight.T + block.from_receiver.bias))
     received = torch.stack([messages[edge_index[1] == i].sum(0) for i in range(5)])
     expected = block.update_mlp(torch.cat([receivers, received], dim=1))
-    updated, kept, _ = block(senders, receivers, [edges], edge_index)
+    updated, kept, _ = block(senders, receivers, [edges], Ends(*edge_index, 5, same=False))
     assert torch.allclose(updated, expected)
     assert torch.allclose(kept[0], messages)
 
@@ -84,7 +84,7 @@ def test_edges_in_blocks_are_the_plain_network_with_the_same_gradients(skip, n_s
         return [effect.detach(), *torch.autograd.grad(effect.square().sum(), used)]
 
     plain = results()
-    monkeypatch.setattr("gns_pyg.models.mlp.BLOCK", 16 * WIDTH)
+    monkeypatch.setattr("gns_pyg.models.mlp.BLOCK", 16 * WIDTH // torch.get_num_threads())
     for expected, found in zip(plain, results(), strict=True):
         assert torch.allclose(found, expected, rtol=1e-5, atol=1e-5 * float(expected.abs().max()))
 
@@ -124,7 +124,7 @@ def test_parted_layer_norms_give_what_whole_ones_give(n_sender, n_blocks, monkey
     senders, grains = torch.randn(50, 4, generator=random), torch.randn(60, 3, generator=random)
     edges, pairs = torch.randn(400, 2, generator=random), torch.randint(0, 50, (2, 200), generator=random)
     inputs = None if n_sender is None else senders, grains, edges, torch.cat([pairs, pairs.flip(0)], dim=1)
-    monkeypatch.setattr("gns_pyg.models.mlp.BLOCK", -(-EDGES // n_blocks) * WIDTH)
+    monkeypatch.setattr("gns_pyg.models.mlp.BLOCK", -(-EDGES // n_blocks) * WIDTH // torch.get_num_threads())
     expected = model(*inputs).detach()
     with torch.inference_mode():
         found = model(*inputs)
