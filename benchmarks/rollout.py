@@ -1,10 +1,11 @@
 r"""Full-size roll-outs against Yade on the same two cores: `python -m benchmarks.rollout`.
 
 Yade runs a case of the paper's hopper and drum with two threads, at the paper's 1e-5 s and at its largest step that
-still gives the same observables (`scene.dem.dt_s=auto`); both files are kept in $GNS_DATA/rollout_benchmark. Then every
-bundle of MODELS rolls the second one out, on two threads, and is judged against it; its time is the median of three.
-Writes benchmarks/results/rollout.json. One row is the full-size bundle that ships; the others are trained on the
-reduced scenes first, for example
+still gives the same observables (`scene.dem.dt_s=auto`), anew every time; both files are kept in
+$GNS_DATA/rollout_benchmark. Then every bundle of MODELS rolls the second one out, on two threads, and is judged against
+it; its time is the median of three. Writes benchmarks/results/rollout.json. One row is the full-size bundle that ships,
+two go on from it on longer frames (docs/tradeoff.md, "At full size"); the others are trained on the reduced scenes
+first, for example
 
     python train.py scene=hopper_small model=contact model.hidden=128 training.updates=1500 \
         hydra.run.dir=runs/speed/hopper_128
@@ -40,6 +41,8 @@ MODELS = {  # name: folder of its run, options
     "paper's width, frames of 20 ms": ("12820", ("scene.frame_dt_s=0.02",)),
     "fast": ("fast", ()),
     "fast, frames of 20 ms": ("fast20", ("scene.frame_dt_s=0.02",)),
+    "full size, frames of 10 ms": ("full10", ("scene.frame_dt_s=0.01",)),
+    "full size, frames of 5 ms": ("full5", ("scene.frame_dt_s=0.005", "compare_every_s=0.01")),
     SHIPS: ("full", ("scene.frame_dt_s=0.0025", "compare_every_s=0.01")),
 }
 CASE, THREADS, ROUNDS = 40, 2, 3
@@ -60,7 +63,9 @@ def main() -> None:
 
 def yade_seconds(scene: str, name: str, step: str) -> float:
     """Wall seconds per simulated second."""
-    out = [f"scene={scene}", f"case={CASE}", f"scene.dem.dt_s={step}", f"cores={THREADS}", f"out={DATA}/{scene}_{name}"]
+    folder = DATA / f"{scene}_{name}"
+    (folder / f"case_{CASE:03d}.h5").unlink(missing_ok=True)
+    out = [f"scene={scene}", f"case={CASE}", f"scene.dem.dt_s={step}", f"cores={THREADS}", f"out={folder}"]
     case = Trajectory(generate(config("generate", *out)))
     return case.run["wall_clock_s"] / (case.times_s[-1] - case.times_s[0])
 

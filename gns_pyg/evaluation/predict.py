@@ -24,6 +24,7 @@ from gns_pyg.dynamics.rollout import rollout
 from gns_pyg.dynamics.simulator import Simulator
 from gns_pyg.errors import DataError, NumericalError
 from gns_pyg.evaluation.errors import position_error
+from gns_pyg.models.mlp import fixed_weights
 from gns_pyg.state import State, Window
 
 log = logging.getLogger(__name__)
@@ -196,11 +197,12 @@ def _run(simulator: Simulator, state: State, n_frames: int, steps: int, see: Cal
     state, reach_m = state.to(simulator.scale.device), simulator.cutoff_m
     states, seconds = rollout(step, state, n_frames * steps, settles=simulator.settles, reach_m=reach_m), 0.0
     simulator.guard.reset()
-    for number in tqdm(range(1, n_frames + 1), desc="roll-out", unit="frame", leave=False, disable=None):
-        begin = time.perf_counter()
-        following = deque(islice(states, steps), maxlen=1)[0].to("cpu")
-        seconds += time.perf_counter() - begin
-        see(number, following)
+    with fixed_weights(simulator):
+        for number in tqdm(range(1, n_frames + 1), desc="roll-out", unit="frame", leave=False, disable=None):
+            begin = time.perf_counter()
+            following = deque(islice(states, steps), maxlen=1)[0].to("cpu")
+            seconds += time.perf_counter() - begin
+            see(number, following)
     if (first := simulator.guard.first) is not None:
         log.warning(
             "%d times a grain would have gone through a wall and was stopped there, first grain %d at %.3g m/s at "

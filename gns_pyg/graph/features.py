@@ -31,7 +31,7 @@ def grain_edges(
         slip = surface_slip(state, rel_vel, direction, sender, receiver)
         ahead = torch.linalg.vector_norm(rel_pos + rel_vel * dt_s, dim=1)
         features += _contact(distance - touch, ahead - touch, rel_vel, slip, direction, radius, velocity_m_s)
-    return torch.cat(features, dim=1).to(dtype)
+    return torch.cat([columns.to(dtype) for columns in features], dim=1)
 
 
 def wall_edges(
@@ -49,7 +49,7 @@ def wall_edges(
         slip = surface_slip(state, rel_vel, -normal, grain)
         ahead = height - dot(rel_vel, normal) * dt_s
         features += _contact(height - radius, ahead - radius, rel_vel, slip, -normal, radius, velocity_m_s)
-    return torch.cat(features, dim=1).to(dtype)
+    return torch.cat([columns.to(dtype) for columns in features], dim=1)
 
 
 def dot(a: Float[Tensor, "n 3"], b: Float[Tensor, "n 3"]) -> Float[Tensor, " n"]:

@@ -8,7 +8,7 @@ from gns_pyg.models.interaction import Ends, Interaction
 from gns_pyg.models.mlp import ROWS, Mlp, blocks, mlp, recurring
 from gns_pyg.state import reached
 
-EDGES = 512  # edges come in multiples of it
+EDGES = 256  # edges come in multiples of it
 
 
 class ContactNetwork(nn.Module):

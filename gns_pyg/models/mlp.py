@@ -1,7 +1,8 @@
 """The one kind of small network everything else is made of."""
 
 import itertools
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from typing import Any
 
 import torch
@@ -17,20 +18,33 @@ if ONE_DNN and torch.ops.mkldnn._is_mkldnn_bf16_supported():
 WIDE = 100  # with gradients, layers from this width on gain more by oneDNN than calling it costs
 
 
+Parted = tuple[Callable[[Tensor], Tensor], tuple[Tensor, Tensor] | None]
+
+
 class Mlp(nn.Sequential):
     """Linear layers with ReLU between them, then perhaps a layer norm; on a CPU oneDNN's products (see `dense`)."""
+
+    kept: dict[tuple[torch.dtype, bool, bool], Parted] | None = None  # see `fixed_weights`
 
     def forward(self, rows: Tensor) -> Tensor:
         function, affine = self.parted(rows.dtype)
         return function(rows) if affine is None else torch.addcmul(affine[1], function(rows), affine[0])
 
-    def parted(self, dtype: torch.dtype) -> tuple[Callable[[Tensor], Tensor], tuple[Tensor, Tensor] | None]:
+    def parted(self, dtype: torch.dtype) -> Parted:
         """A function, a weight and a bias, so that function(rows) * weight + bias is what `forward` returns; None for
         the two where the function does it all.
 
         Where oneDNN multiplies without gradients, the last layer's weights are centred instead of every row that comes
         out, whose mean is zero then: a layer norm only has to scale it, in a third of the time.
         """
+        if self.kept is None:
+            return self._parted(dtype)
+        circumstances = dtype, torch.is_grad_enabled(), torch.is_autocast_enabled("cpu")
+        if circumstances not in self.kept:
+            self.kept[circumstances] = self._parted(dtype)
+        return self.kept[circumstances]
+
+    def _parted(self, dtype: torch.dtype) -> Parted:
         layers, norm, affine = [module for module in self if isinstance(module, nn.Linear)], self[-1], None
         weight: Tensor = layers[-1].weight
         bias: Tensor = layers[-1].bias
@@ -52,6 +66,19 @@ class Mlp(nn.Sequential):
             return rows.mul_(length.square_().div_(rows.shape[1]).add_(norm.eps).rsqrt_())
 
         return function, affine
+
+
+@contextmanager
+def fixed_weights(model: nn.Module) -> Iterator[None]:
+    """Nobody changes the weights of `model` meanwhile: what is worked out from them alone is worked out once."""
+    perceptrons = [module for module in model.modules() if isinstance(module, Mlp)]
+    try:
+        for module in perceptrons:
+            module.kept = {}
+        yield
+    finally:
+        for module in perceptrons:
+            module.kept = None
 
 
 def mlp(n_in: int, hidden: int, n_out: int, layers: int, *, layer_norm: bool = False) -> Mlp:

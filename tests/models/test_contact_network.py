@@ -5,7 +5,7 @@ import torch
 
 from gns_pyg.models.contact_network import EDGES, ContactNetwork
 from gns_pyg.models.interaction import Ends, Interaction
-from gns_pyg.models.mlp import ONE_DNN, ROWS, dense
+from gns_pyg.models.mlp import ONE_DNN, ROWS, dense, fixed_weights
 
 WIDTH = 8
 
@@ -108,7 +108,7 @@ def test_without_gradients_layers_see_the_same_numbers_of_rows_at_every_step(n_s
                 patch.setattr(f"gns_pyg.models.{module}.dense", spied)
             found = model(senders, grains, edges, edge_index)
         assert torch.allclose(found, expected, rtol=1e-5, atol=1e-5 * float(expected.abs().max()))
-    assert seen <= {ROWS, 2 * ROWS, 3 * ROWS, EDGES, 4 * EDGES}
+    assert seen <= {ROWS, 2 * ROWS, 3 * ROWS, EDGES, 2 * EDGES, 7 * EDGES}
 
 
 @pytest.mark.parametrize("n_blocks", [1, 5])
@@ -124,12 +124,34 @@ def test_parted_layer_norms_give_what_whole_ones_give(n_sender, n_blocks, monkey
     senders, grains = torch.randn(50, 4, generator=random), torch.randn(60, 3, generator=random)
     edges, pairs = torch.randn(400, 2, generator=random), torch.randint(0, 50, (2, 200), generator=random)
     inputs = None if n_sender is None else senders, grains, edges, torch.cat([pairs, pairs.flip(0)], dim=1)
-    monkeypatch.setattr("gns_pyg.models.mlp.BLOCK", -(-EDGES // n_blocks) * WIDTH // torch.get_num_threads())
+    monkeypatch.setattr("gns_pyg.models.mlp.BLOCK", -(-2 * EDGES // n_blocks) * WIDTH // torch.get_num_threads())
     expected = model(*inputs).detach()
     with torch.inference_mode():
         found = model(*inputs)
     assert torch.allclose(found, expected, rtol=1e-5, atol=1e-5 * float(expected.abs().max()))
     assert not ONE_DNN or not torch.equal(found, expected)  # they are two ways
+
+
+def test_weights_are_fixed_while_somebody_says_so_and_no_longer():
+    """What is kept meanwhile gives the same, with gradients and without; new weights count afterwards."""
+    model, edge_index = network(), torch.tensor([[0, 1, 2], [1, 0, 1]])
+    inputs = None, torch.randn(4, 3), torch.randn(3, 2), edge_index
+
+    def both_ways() -> list[torch.Tensor]:
+        with torch.inference_mode():
+            fast = model(*inputs)
+        return [fast, model(*inputs).detach()]
+
+    plain = both_ways()
+    with fixed_weights(model):
+        for _ in range(2):
+            assert all(torch.equal(*pair) for pair in zip(plain, both_ways(), strict=True))
+    with torch.no_grad():
+        for weights in model.parameters():
+            weights.mul_(1.5)
+    changed = both_ways()
+    assert torch.allclose(*changed, rtol=1e-5, atol=1e-6)
+    assert not torch.allclose(changed[0], plain[0], rtol=0.01)
 
 
 @pytest.mark.parametrize("n_sender", [None, 4])
