@@ -5,7 +5,7 @@ still gives the same observables (`scene.dem.dt_s=auto`); the last files are kep
 every bundle of MODELS rolls the second one out, on two threads, and is judged against it. All times are medians of
 three. Half an hour. Writes benchmarks/results/rollout.json. One row is the full-size bundle that ships,
 one goes on from it on longer frames (docs/tradeoff.md, "At full size"); the others are trained on the reduced scenes
-first (a row whose bundle is missing is left out), for example
+first (a row whose bundle is missing is left out; 128touching with requires.touching_pairs=true), for example
 
     python train.py scene=hopper_small model=contact model.hidden=128 training.updates=1500 \
         hydra.run.dir=runs/speed/hopper_128
@@ -37,6 +37,7 @@ STEPS = {"1e-5": "1e-5", "equivalent": "auto"}
 SHIPS = "ships"
 MODELS = {  # name: folder of its run, options
     "paper's width": ("128", ()),
+    "paper's width, touching pairs": ("128touching", ()),
     "paper's width, bfloat16": ("128", ("execution.precision=bfloat16",)),
     "paper's width, frames of 20 ms": ("12820", ("scene.frame_dt_s=0.02",)),
     "fast": ("fast", ()),

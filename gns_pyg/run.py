@@ -268,7 +268,8 @@ def build(
             flat({"model": asdict(m), "requires": asdict(r)})
             for m, r in ((config, requires), (start.config, start.requires))
         )
-        elsewhere = ("requires.reasons", "requires.symmetry")  # training turns windows by it, networks do not know it
+        # turned windows and left out edges are matters of training; networks do not know of them
+        elsewhere = ("requires.reasons", "requires.symmetry", "requires.touching_pairs")
         differ = [key for key in sorted({*here, *there}) if here.get(key) != there.get(key)]
         can_gain = start.config.network == "impulse" and not start.requires.material_features
         gained = requires.material_features if can_gain else []

@@ -26,8 +26,8 @@ def fine(values: Tensor, unit: Tensor | float) -> Tensor:
     size = values / unit
     sign = torch.copysign(torch.ones_like(size), size)  # never 0, so that the gradient at 0 is right
     size = size * sign
-    # asinh, whose own kernel takes ten times as long on a CPU
-    return sign * torch.log1p(size + size * (size / (1 + torch.hypot(size, torch.ones_like(size))))) / 4
+    # asinh, whose own kernel takes longer on a CPU; beyond 1e19, where the square overflows, log(2) too small
+    return sign * torch.log1p(size + size * (size / (1 + (size * size + 1).sqrt()))) / 4
 
 
 def reached(n: int, *rows: Int[Tensor, " _"]) -> Bool[Tensor, " n"]:

@@ -101,9 +101,12 @@ class Captured:
         near = torch.ones_like(everyone.batch, dtype=torch.bool) if everyone.active is None else everyone.active
         graph = _among(graph, near, nobody, nothing)
         if simulator.requires.free_grains:
-            free_pos = simulator.integrator.without_contact(everyone).pos
-            near = can_touch(everyone, free_pos, graph, simulator.scene.frame_dt_s)
-            graph = _among(graph, near, nobody, nothing)
+            meet, meet_wall = simulator.near(everyone, graph)
+            if simulator.requires.touching_pairs:
+                pairs, contacts = _only(graph.grain_edges, meet, nobody), _only(graph.wall_edges, meet_wall, nothing)
+                graph = Graph(pairs, contacts, walls)
+            else:
+                graph = _among(graph, can_touch(graph, meet, meet_wall, n + 1), nobody, nothing)
         if simulator.pairs_once:
             edges = graph.grain_edges
             graph = replace(graph, grain_edges=_only(edges, edges[0] < edges[1], nobody))

@@ -12,7 +12,7 @@ from torch import Tensor, nn
 from gns_pyg.config import require
 from gns_pyg.dynamics.boundary import Boundary
 from gns_pyg.dynamics.execution import Execution
-from gns_pyg.dynamics.free_grains import among, can_touch
+from gns_pyg.dynamics.free_grains import MARGIN_RADII, among, can_meet, can_touch, meeting, pair_margin_m
 from gns_pyg.dynamics.guard import Guard
 from gns_pyg.dynamics.integrator import Integrator
 from gns_pyg.dynamics.model_config import ModelConfig
@@ -62,6 +62,9 @@ class Simulator(nn.Module):
         self.register_buffer("scale", scale, persistent=False)
         self.execution = Execution()
         self.edges_done = 0  # edges that went through the networks so far
+        pairs_alone = requires.touching_pairs and config.self_loops
+        loops = "false where only pairs that can touch are edges"
+        require(not pairs_alone, "model.self_loops", "true", loops, "set requires.touching_pairs=false")
         self._conditions = [PARAMETERS.index(name) for name in requires.material_features]
 
         self.boundary: Boundary | None = None
@@ -265,8 +268,9 @@ class Simulator(nn.Module):
     @property
     def halo_m(self) -> float:
         """How far away a grain can be and still have a part in another's next step: a cutoff per round of message
-        passing, and one for who can touch it."""
-        return (self.config.layers + self.requires.free_grains) * self.cutoff_m * (1 + 1e-9)
+        passing, and one for who can touch it, which a pair's own ends do not need."""
+        ask = self.requires.free_grains and not self.requires.touching_pairs
+        return (self.config.layers + ask) * self.cutoff_m * (1 + 1e-9)
 
     @property
     def cutoff_m(self) -> float:
@@ -295,12 +299,20 @@ class Simulator(nn.Module):
             walls, contacts = self.boundary.contacts(state)
             graph = Graph(edges, contacts, walls)
         if self.requires.free_grains:
-            free_pos = self.integrator.without_contact(state).pos
-            graph = among(graph, can_touch(state, free_pos, graph, self.scene.frame_dt_s))
+            near = self.near(state, graph)
+            alone = self.requires.touching_pairs
+            graph = meeting(graph, *near) if alone else among(graph, can_touch(graph, *near, len(state.pos)))
         if self.pairs_once:
             edges = graph.grain_edges
             graph = replace(graph, grain_edges=edges[:, edges[0] < edges[1]])
         return graph
+
+    def near(self, state: State, graph: Graph) -> tuple[Bool[Tensor, " e"], Bool[Tensor, " w"]]:
+        """Which edges' ends can meet within the frame (see `free_grains`)."""
+        dt_s, margin_m = self.scene.frame_dt_s, MARGIN_RADII * state.radius
+        if self.requires.touching_pairs:
+            margin_m = pair_margin_m(state.radius, self.scene.gravity_m_s2, dt_s)
+        return can_meet(state, self.integrator.without_contact(state).pos, graph, dt_s, margin_m)
 
     def _grain_features(self, state: State) -> Float[Tensor, "n_grains f"]:
         columns = [state.vel / self.statistics.velocity_m_s]

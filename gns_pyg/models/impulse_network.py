@@ -13,6 +13,7 @@ from dataclasses import dataclass
 import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor, nn
+from torch.nn.functional import embedding_bag
 from torch_geometric.nn import MessagePassing
 
 from gns_pyg.models.mlp import ROWS, blocks, linear, mlp, only, recurring
@@ -45,19 +46,22 @@ class Piece:
     contacts as its last dimension: the same component of all of them lies together in memory.
 
     Attributes:
-        ends, scalars, slow, wall_vel: as of `Contacts`.
+        scalars, slow, wall_vel: as of `Contacts`.
+        ends: their grains: receiver, between grains then sender.
+        stacked: the same where what receivers show is followed by what senders do.
         basis: the contacts' directions; first the normal.
-        told: who tells whom: every [sender, receiver], between grains then every [receiver, sender].
-        share: how much more it moves the one who is told than the other (see `Contacts`).
+        told: `ends` without what fills up their number, side by side.
+        share: how much more each of them is moved than the other (see `Contacts`).
     """
 
-    ends: Int[Tensor, "2 e"]
+    ends: Int[Tensor, "e sides"]
+    stacked: Int[Tensor, "e sides"]
     scalars: Float[Tensor, "e f"]
     basis: Float[Tensor, "3 b e"]
     slow: float
     wall_vel: Float[Tensor, "e 3"] | None
-    told: Int[Tensor, "2 m"]
-    share: Float[Tensor, "m 1"] | None
+    told: tuple[Int[Tensor, " m"], ...]
+    share: tuple[Float[Tensor, "m 1"], ...] | None
 
 
 class ImpulseNetwork(nn.Module):
@@ -139,20 +143,18 @@ class ImpulseRound(MessagePassing):
         motion = torch.cat([grains.vel.flatten(1), grains.spin.flatten(1)], dim=1)
         sign = motion.new_ones(heard + 2 * third)
         sign[heard : heard + third] = -1  # the sender's impulse; what it hears and how it turns are the receiver's
-        latent, reflected, after = linear(self.from_ends, grains.latent), motion * sign[heard:], []
+        latent, after = linear(self.from_ends, grains.latent), []
+        moving = torch.cat([motion * sign[heard:], motion])
         gained = motion.new_zeros(n, len(sign))
         for piece, before in zip(contacts, edges, strict=True):
-            edge, message, change = self.edge_update(piece, before, latent, motion, reflected)
-            rows = torch.cat([message[:, :heard], change], dim=1).to(gained.dtype)
-            rows = rows[: piece.told.shape[1] // (1 + self.mutual)]
-            if self.mutual:
-                rows = torch.cat([rows, rows * sign])
-            if piece.share is not None:
-                rows = torch.cat([rows[:, :heard], rows[:, heard:] * piece.share], dim=1)
-            if len(contacts) == 1:
-                gained = self.propagate(piece.told, rows=rows, size=(n, n))
-            else:
-                gained.index_add_(0, piece.told[1], rows)  # sums stay in full precision
+            edge, message, change = self.edge_update(piece, before, latent, moving)
+            rows = torch.cat([message[:, :heard], change], dim=1).to(motion.dtype)[: len(piece.told[0])]
+            for side, named in enumerate(piece.told):
+                given = rows
+                if piece.share is not None:
+                    given = torch.cat([rows[:, :heard], rows[:, heard:] * piece.share[side]], dim=1)
+                told = self.aggregate(given, named, dim_size=n)  # sums stay in full precision
+                gained = gained + told * sign if side else gained + told
             after.append(edge)
         vel, spin = (part.view(grains.vel.shape) for part in gained[:, heard:].chunk(2, dim=1))
         there = grains.latent
@@ -161,15 +163,12 @@ class ImpulseRound(MessagePassing):
         return Grains(there, grains.vel + vel, grains.spin + spin), after
 
     def edge_update(
-        self, contacts: Piece, edge: Tensor, latent: Tensor, motion: Tensor, reflected: Tensor
+        self, contacts: Piece, edge: Tensor, latent: Tensor, moving: Tensor
     ) -> tuple[Tensor, Tensor, Tensor]:
         """What every contact knows after this round, says to its grains, and gives the receiver: impulse and turn in
         every channel, (n_contacts, 6 channels)."""
-        (sender, receiver), basis = contacts.ends, contacts.basis
-        hidden, moving = latent.index_select(0, receiver), reflected.index_select(0, receiver)
-        if self.mutual:
-            hidden, moving = hidden + latent.index_select(0, sender), moving + motion.index_select(0, sender)
-        rel_vel, spin = moving.t().contiguous().view(2, 3, self.channels, -1)
+        hidden, basis = gathered(latent, contacts.ends), contacts.basis
+        rel_vel, spin = gathered(moving, contacts.stacked).t().contiguous().view(2, 3, self.channels, -1)
         if contacts.wall_vel is not None:
             rel_vel = torch.cat([rel_vel[:, :1] + contacts.wall_vel.t()[:, None], rel_vel[:, 1:]], dim=1)
         slip = rel_vel - cross(spin, basis[:, :1])  # of the surfaces in touch
@@ -184,9 +183,6 @@ class ImpulseRound(MessagePassing):
         impulse = (basis[:, :, None] * factors[:-1]).sum(1) + against * slip
         change = torch.cat([impulse, -SPHERE * cross(impulse, basis[:, :1])])
         return edge, message, change.flatten(0, 1).t().contiguous()
-
-    def message(self, rows: Tensor) -> Tensor:
-        return rows
 
 
 class Damping(nn.Module):
@@ -214,36 +210,49 @@ class Damping(nn.Module):
         return self.shares(torch.cat([after.latent, fine(torch.cat(lengths, dim=1), slow)], dim=1)).sigmoid()
 
 
-def pieces(contacts: Contacts, hidden: int, *, mutual: bool) -> list[Piece]:
-    """Contacts as pieces that are best handled one after the other."""
-    always = [blocks(side, hidden) for side in (contacts.ends.T, contacts.scalars, contacts.basis)]
+def pieces(contacts: Contacts, hidden: int, n: int, *, mutual: bool) -> list[Piece]:
+    """Contacts between `n` grains as pieces that are best handled one after the other."""
+    sides = contacts.ends.flip(0)[: 1 + mutual]
+    always = [blocks(side, hidden) for side in (sides.T, contacts.scalars, contacts.basis)]
     none = [None] * len(always[0])
     perhaps = [none if side is None else blocks(side, hidden) for side in (contacts.wall_vel, contacts.share)]
     found = []
     for ends, scalars, basis, wall_vel, share in zip(*always, *perhaps, strict=True):
+        more = recurring(ends, ROWS, hidden)
         found.append(
             Piece(
-                ends=recurring(ends, ROWS, hidden).T,
+                ends=more,
+                stacked=torch.stack([side + k * n for k, side in enumerate(more.unbind(1))], dim=1),
                 scalars=recurring(scalars, ROWS, hidden),
                 basis=recurring(basis, ROWS, hidden).permute(1, 2, 0).contiguous(),
                 slow=contacts.slow,
                 wall_vel=None if wall_vel is None else recurring(wall_vel, ROWS, hidden),
-                told=(torch.cat([ends, ends.flip(1)]) if mutual else ends).T,
-                share=None if share is None else share.flip(1).T.reshape(-1, 1),
+                told=ends.unbind(1),
+                share=None if share is None else share.flip(1).split(1, dim=1),
             )
         )
     return found
 
 
+def gathered(table: Float[Tensor, "m f"], rows: Int[Tensor, "e sides"]) -> Float[Tensor, "e f"]:
+    """The sum of every contact's rows of a table."""
+    if not torch.is_grad_enabled():
+        return embedding_bag(rows, table, mode="sum")
+    first, *others = (table.index_select(0, side) for side in rows.unbind(1))
+    return sum(others, first)
+
+
 def cross(a: Float[Tensor, "3 channels e"], b: Float[Tensor, "3 1 e"]) -> Float[Tensor, "3 channels e"]:
     """a x b; torch.linalg.cross takes several times as long on a CPU."""
-    return a.roll(-1, 0) * b.roll(1, 0) - a.roll(1, 0) * b.roll(-1, 0)
+    (x, y, z), (u, v, w) = a, b
+    return torch.stack([y * w - z * v, z * u - x * w, x * v - y * u])
 
 
 def exchange(grains: Grains, kinds: Sequence[tuple[ImpulseNetwork, Contacts]]) -> Grains:
     """What grains carry after all rounds, in which the kinds of contact take turns."""
-    lots = [pieces(contacts, network.hidden, mutual=network.mutual) for network, contacts in kinds]
-    hears = [network.hears(len(grains.latent), contacts) for network, contacts in kinds]
+    n = len(grains.latent)
+    lots = [pieces(contacts, network.hidden, n, mutual=network.mutual) for network, contacts in kinds]
+    hears = [network.hears(n, contacts) for network, contacts in kinds]
     edges: list[list[Tensor] | None] = [None] * len(kinds)
     for turn in range(len(kinds[0][0].rounds)):
         for kind, (network, _) in enumerate(kinds):

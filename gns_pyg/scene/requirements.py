@@ -25,6 +25,7 @@ class Requires:
     reachable_points: Union[bool, str] = "auto"
     free_flight: Union[bool, str] = "auto"
     free_grains: Union[bool, str] = "auto"
+    touching_pairs: Union[bool, str] = "auto"
     radius_features: Union[bool, str] = "auto"
     material_features: Union[bool, str] = "auto"
     symmetry: Union[bool, str] = "auto"
@@ -53,6 +54,7 @@ class Requirements:
         reachable_points: only boundary points and grains within reach of each other enter the wall network.
         free_flight: the scene's law for a grain that touches nothing is subtracted, not learned.
         free_grains: grains that can touch nothing within the frame follow that law, outside the networks.
+        touching_pairs: only pairs (and boundary points) that can touch within the frame exchange anything.
         radius_features: each grain's radius as a feature.
         material_features: parameters (of `scene.PARAMETERS`) that condition the networks.
         symmetry: training windows are turned and mirrored by the scene's own symmetry.
@@ -77,6 +79,7 @@ class Requirements:
     state: str
     rest: bool = False  # bundles made before have none
     damped: bool = False  # nor this
+    touching_pairs: bool = False  # nor this
     reasons: dict[str, str] = field(default_factory=dict)
 
     def __str__(self) -> str:
@@ -118,15 +121,20 @@ def resolve(scene: Scene, parameters: Mapping[str, Sequence[float]], requires: R
         rows[row], reasons[row] = forced, f"forced; {reason}"
     if not isinstance(rows["material_features"], list):
         rows["material_features"] = list(PARAMETERS) if rows["material_features"] else []
-    for row in ("free_grains", "rest"):  # they need the law
+    for row, law in (("free_grains", "free_flight"), ("touching_pairs", "free_grains"), ("rest", "free_flight")):
         if getattr(requires, row) == "auto":
-            rows[row] = rows[row] and rows["free_flight"]
+            rows[row] = rows[row] and rows[law]
     for row in ("wall_velocity", "wall_friction", "static_walls", "reachable_points"):
         carried = rows["wall_network"] or not rows[row]
         require(carried, f"requires.{row}", "true", "a wall network to carry it", "set requires.wall_network=true too")
     flies = rows["free_flight"] or not rows["free_grains"]
     law = "grains that the networks leave out follow the free-flight law"
     require(flies, "requires.free_grains", "true without requires.free_flight", law, "set requires.free_grains=false")
+    fly = rows["free_grains"] or not rows["touching_pairs"]
+    none = "grains without a pair follow the free-flight law"
+    require(
+        fly, "requires.touching_pairs", "true without requires.free_grains", none, "set requires.touching_pairs=false"
+    )
     found = derived["symmetry"][1]
     symmetric = derived["symmetry"][0] or not rows["symmetry"]
     require(symmetric, "requires.symmetry", "true", f"false: {found}", "set requires.symmetry=auto")
@@ -184,6 +192,7 @@ def _derive(scene: Scene, parameters: Mapping[str, Sequence[float]]) -> dict[str
         "reachable_points": (bool(parts), "points and grains out of reach stay out" if parts else "no boundary"),
         "free_flight": (True, f"gravity {scene.gravity_m_s2} m/s^2 with damping {scene.damping} is known, not learned"),
         "free_grains": (True, "grains that can touch nothing within a frame follow it"),
+        "touching_pairs": (False, "only where asked for: pairs that cannot touch within a frame stay out"),
         "radius_features": (
             len(radii) > 1,
             f"{len(radii)} radii" if len(radii) > 1 else "one radius: no radius feature",

@@ -272,15 +272,15 @@ DEFECTS = [
     Defect(
         "a contact's impulse given to both grains alike",
         IMPULSES,
-        "torch.cat([rows, rows * sign])",
-        "torch.cat([rows, rows])",
+        "gained + told * sign if side",
+        "gained + told if side",
         ("tests/models/test_impulse_network.py::test_no_momentum_is_made_between_grains",),
     ),
     Defect(
         "the sender of an impulse turned the other way",
         IMPULSES,
-        "torch.cat([rows, rows * sign])",
-        "torch.cat([rows, torch.cat([rows[:, :heard], -rows[:, heard:]], dim=1)])",
+        "gained + told * sign if side",
+        "gained + torch.cat([told[:, :heard], -told[:, heard:]], dim=1) if side",
         ("tests/models/test_impulse_network.py::test_a_tangential_impulse_turns_both_grains_alike",),
     ),
     Defect(

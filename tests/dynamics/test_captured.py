@@ -44,6 +44,8 @@ def test_the_step_is_the_simulator_s(scene, n_per_graph) -> None:
     [
         simulators.PAPER,
         simulators.IMPULSE,
+        simulators.TOUCHING,
+        {"touching_pairs": True},
         {"self_loops": True},
         {"free_grains": False},
         {"state": "velocity"},

@@ -7,6 +7,7 @@ import torch
 
 from gns_pyg.data.trajectory import Trajectory
 from gns_pyg.data.windows import read_window
+from gns_pyg.errors import ConfigError
 from gns_pyg.state import State
 from tests import scenes
 from tests.simulators import simulator
@@ -76,6 +77,25 @@ def test_a_grain_that_is_pushed_counts_with_its_neighbour():
     model = simulator(scenes.scene(3, 5, boundary={}))
     at = state([[0, 0, 0], [2 * RADIUS, 0, 0], [0, 2.4 * RADIUS, 0]], [[0, 0, 0]] * 3)
     assert in_networks(model, at) == [True, True, False]
+
+
+def test_pairs_that_cannot_touch_exchange_nothing():
+    """A chain of touching grains over a floor, and one that flies towards its end."""
+    part = {"shape": FLOOR, "points": 400, "friction_angle_rad": 0.5}
+    changes = {"touching_pairs": True, "cutoff_grain_radii": 3.0}
+    scene = scenes.scene(4, 5, boundary={"floor": part}, gravity_m_s2=[0.0, 0.0, 0.0])
+    row = [[0, 0, 1.04 * RADIUS], [2 * RADIUS, 0, 1.2 * RADIUS], [4.04 * RADIUS, 0, 1.2 * RADIUS]]
+    at = state([*row, [3.2 * RADIUS, 2.5 * RADIUS, 1.2 * RADIUS]], [[0, 0, 0]] * 3 + [[0.5, -0.6, 0]])
+    for network in ("message", "impulse"):
+        graph = simulator(scene, network=network, **changes).graph(at)
+        pairs = {tuple(sorted(pair)) for pair in graph.grain_edges.T.tolist()}
+        assert pairs == {(0, 1), (1, 2), (2, 3)}  # and not (1, 3), also within the cutoff, which do not meet
+        assert set(graph.wall_edges[1].tolist()) == {0}
+
+
+def test_loops_are_no_touching_pairs():
+    with pytest.raises(ConfigError, match="model.self_loops"):
+        simulator(scenes.scene(2, 5, boundary={}), self_loops=True, touching_pairs=True)
 
 
 def test_passing_grains_step_by_step(tmp_path):

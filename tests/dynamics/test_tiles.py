@@ -46,7 +46,15 @@ def test_a_ball_is_the_nearest_grains_of_each_graph_and_its_margin() -> None:
 
 @pytest.mark.parametrize(
     "changes",
-    [{}, {"free_grains": False}, {"layers": 1}, {"self_loops": True}, simulators.PAPER, simulators.IMPULSE],
+    [
+        {},
+        {"free_grains": False},
+        {"layers": 1},
+        {"self_loops": True},
+        simulators.PAPER,
+        simulators.IMPULSE,
+        simulators.TOUCHING,
+    ],
 )
 @pytest.mark.parametrize("most", [7, 40])
 def test_tiles_give_the_same_step(changes, most) -> None:

@@ -79,6 +79,7 @@ def test_state_can_be_forced(state):
         ({"wall_network": "maybe"}, "requires.wall_network"),
         ({"state": "momentum"}, "requires.state"),
         ({"free_flight": False, "free_grains": True}, "requires.free_grains"),
+        ({"free_grains": False, "touching_pairs": True}, "requires.touching_pairs"),
     ],
 )
 def test_bad_forcing(forced, message):
