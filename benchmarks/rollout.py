@@ -5,7 +5,8 @@ still gives the same observables (`scene.dem.dt_s=auto`); the last files are kep
 every bundle of MODELS rolls the second one out, on two threads, and is judged against it. All times are medians of
 three. Half an hour. Writes benchmarks/results/rollout.json. One row is the full-size bundle that ships,
 one goes on from it on longer frames (docs/tradeoff.md, "At full size"); the others are trained on the reduced scenes
-first (a row whose bundle is missing is left out; 128touching with requires.touching_pairs=true), for example
+first (128touching with requires.touching_pairs=true; a row whose bundle is missing is left out, but for the first,
+whose factors stand for the scene), for example
 
     python train.py scene=hopper_small model=contact model.hidden=128 training.updates=1500 \
         hydra.run.dir=runs/speed/hopper_128
@@ -34,9 +35,9 @@ from gns_pyg.evaluation.predict import roll_out, start_frame
 OUT = Path(__file__).parent / "results" / "rollout.json"
 DATA = Path(os.environ.get("GNS_DATA", "data")) / "rollout_benchmark"
 STEPS = {"1e-5": "1e-5", "equivalent": "auto"}
-SHIPS = "ships"
+PAPER, SHIPS = "paper's width", "ships"
 MODELS = {  # name: folder of its run, options
-    "paper's width": ("128", ()),
+    PAPER: ("128", ()),
     "paper's width, touching pairs": ("128touching", ()),
     "paper's width, bfloat16": ("128", ("execution.precision=bfloat16",)),
     "paper's width, frames of 20 ms": ("12820", ("scene.frame_dt_s=0.02",)),
@@ -54,7 +55,7 @@ def main() -> None:
     found: dict[str, Any] = {"machine": machine.processor(), "threads": THREADS}
     for scene in ("hopper", "drum"):
         yade = {name: yade_seconds(scene, name, step) for name, step in STEPS.items()}
-        rows = [judged(scene, name, yade) for name in MODELS if name == SHIPS or bundle(scene, name).exists()]
+        rows = [judged(scene, name, yade) for name in MODELS if name in (PAPER, SHIPS) or bundle(scene, name).exists()]
         factors = {f"factor_yade_{step}": rows[0][f"factor_yade_{step}"] for step in STEPS}
         found[scene] = factors | {"yade_seconds_per_simulated_second": yade, "models": rows}
         OUT.write_text(json.dumps(found, indent=1) + "\n")
