@@ -39,7 +39,7 @@ def separated(
     touch = state.radius[sender] + state.radius[receiver]
     cubes = state.radius**3
     share = (cubes[sender] / (cubes[sender] + cubes[receiver]))[:, None]  # the lighter one gives way
-    planes = None if walls is None else _nearest(state, walls, contacts)
+    planes = None if walls is None else nearest_walls(state, walls, contacts)
     pos, vel = state.pos, state.vel
     for _ in range(sweeps):
         apart = pos.index_select(0, receiver) - pos.index_select(0, sender)
@@ -61,7 +61,7 @@ def separated(
     return replace(state, pos=pos, vel=vel)
 
 
-def _nearest(
+def nearest_walls(
     state: State, walls: Walls, contacts: Int[Tensor, "2 n_contacts"]
 ) -> tuple[Tensor, Tensor, Tensor, Tensor]:
     """Every grain that has a boundary point in reach, (n,); of the nearest one: place, normal and velocity, (n, 3)."""

@@ -19,6 +19,8 @@ class TrainingConfig:
         halvings: see `lr_start`; 5 takes 1e-4 to 3.125e-6, the paper's values.
         noise_radii: standard deviation of the noise on input positions, in grain radii.
         noise_velocity: standard deviation of the noise on input velocities (and spins), in their scales.
+        noise_in_walls: share of the grains that touch a wall which start up to a radius deep in it, where no DEM
+            run has any; 0 leaves them.
         unroll: half of the updates start from up to this many of the model's own steps; 0 is one-step training.
         unroll_from: share of the updates after which unrolling begins.
         gradient_clip: largest gradient norm; 0 is no limit.
@@ -40,6 +42,7 @@ class TrainingConfig:
     halvings: int = MISSING
     noise_radii: float = MISSING
     noise_velocity: float = MISSING
+    noise_in_walls: float = MISSING
     unroll: int = MISSING
     unroll_from: float = MISSING
     gradient_clip: float = MISSING
@@ -57,6 +60,7 @@ class TrainingConfig:
             "halvings",
             "noise_radii",
             "noise_velocity",
+            "noise_in_walls",
             "unroll",
             "unroll_from",
             "gradient_clip",
@@ -66,6 +70,8 @@ class TrainingConfig:
         for key in ("seed", *at_least_0):
             value = getattr(self, key)
             require(value >= 0, f"training.{key}", value, "at least 0", f"training.{key}=0 turns it off")
+        most = self.noise_in_walls
+        require(most <= 1, "training.noise_in_walls", most, "0 to 1", "it is a share of grains")
         region = self.region_grains
         require(region is None or region > 0, "training.region_grains", region, "at least 1", "null takes all grains")
         decay = self.average_decay

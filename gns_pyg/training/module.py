@@ -1,7 +1,6 @@
 """What Lightning drives: one update of a simulator."""
 
 from collections.abc import Mapping, Sequence
-from dataclasses import replace
 from typing import Any, cast
 
 import numpy as np
@@ -20,6 +19,7 @@ from gns_pyg.training.augment import transform
 from gns_pyg.training.checkpoint import REMEDY
 from gns_pyg.training.config import TrainingConfig
 from gns_pyg.training.loss import CELL_RADII, balance_loss, cells, mean_loss, share_of_mean
+from gns_pyg.training.noise import perturb
 
 MOST = 1e15  # of any number in a checkpoint beside its tensors
 
@@ -209,26 +209,3 @@ def unlike(found: Any, expected: Any, where: str) -> tuple[str, str] | None:
     if isinstance(expected, int | float) and not 0 <= found <= MOST:
         return f"{where}: {found!r:.60}", f"0 to {MOST:g}"
     return None
-
-
-def perturb(state: State, config: TrainingConfig, simulator: Simulator, randoms: Sequence[torch.Generator]) -> State:
-    """A copy of `state` with Gaussian noise on positions, velocities and spins, each graph's drawn from its generator;
-    `state` itself stays as it is."""
-    sizes = torch.bincount(state.batch, minlength=state.n_graphs).tolist()
-
-    def noise(like: Tensor) -> Tensor:
-        drawn = [
-            torch.randn((size, 3), dtype=like.dtype, generator=random)
-            for size, random in zip(sizes, randoms, strict=True)
-        ]
-        return torch.cat(drawn).to(like.device)
-
-    scale = simulator.statistics
-    return replace(
-        state,
-        pos=state.pos + config.noise_radii * state.radius[:, None] * noise(state.pos),
-        vel=state.vel + config.noise_velocity * scale.velocity_m_s * noise(state.vel),
-        ang_vel=None
-        if state.ang_vel is None
-        else state.ang_vel + config.noise_velocity * scale.spin_rad_s * noise(state.ang_vel),
-    )

@@ -205,7 +205,7 @@ DEFECTS = [
     ),
     Defect(
         "noise added to the stored frames",
-        TRAINING,
+        "gns_pyg/training/noise.py",
         "pos=state.pos + config.noise_radii * state.radius[:, None] * noise(state.pos),",
         "pos=state.pos.add_(config.noise_radii * state.radius[:, None] * noise(state.pos)),",
         ("tests/training/test_module.py::test_noise_is_added_to_a_copy",),

@@ -1,5 +1,7 @@
 """Noise, unrolling and schedule of the training module."""
 
+from dataclasses import replace
+
 import pytest
 import torch
 
@@ -7,7 +9,8 @@ from gns_pyg.data.trajectory import Trajectory
 from gns_pyg.data.windows import Windows
 from gns_pyg.state import Window
 from gns_pyg.training.config import TrainingConfig
-from gns_pyg.training.module import TrainingModule, perturb
+from gns_pyg.training.module import TrainingModule
+from gns_pyg.training.noise import perturb
 from tests import scenes
 from tests.simulators import simulator, state_in_box
 
@@ -19,6 +22,7 @@ CONFIG = dict(
     halvings=5,
     noise_radii=0.1,
     noise_velocity=0.1,
+    noise_in_walls=0.0,
     unroll=4,
     unroll_from=0.5,
     gradient_clip=0.0,
@@ -39,6 +43,25 @@ def test_noise_is_added_to_a_copy():
     assert all(torch.equal(a, b) for a, b in zip(before, (state.pos, state.vel, state.ang_vel), strict=True))
     assert (noisy.pos - state.pos).std().item() == pytest.approx(0.1 * 0.01, rel=0.3)
     assert (noisy.vel - state.vel).std().item() == pytest.approx(0.1 * 0.5, rel=0.3)
+
+
+def test_that_share_of_the_grains_at_a_wall_starts_in_it():
+    """Of 400 grains that lie on a floor and 400 above them."""
+    box = {"kind": "box", "size_m": [0.8, 0.8, 0.8], "center_m": [0.0, 0.0, 0.4]}
+    scene = scenes.scene(800, 5, boundary={"walls": {"shape": box, "points": 8000, "friction_angle_rad": 0.5}})
+    rows = torch.cartesian_prod(torch.arange(-9.5, 10.0), torch.arange(-9.5, 10.0)).double() * 0.03
+    lying, above = (torch.cat([rows, torch.full((400, 1), z).double()], dim=1) for z in (0.01, 0.03))
+    state = replace(state_in_box([800]), pos=torch.cat([lying, above]))
+    config = TrainingConfig(**CONFIG | {"noise_radii": 0.0, "noise_velocity": 0.0, "noise_in_walls": 0.25})
+    noisy = perturb(state, config, simulator(scene), [torch.Generator().manual_seed(0)])
+    depth = (state.pos - noisy.pos) / 0.01
+    moved = depth[:400, 2][depth[:400, 2] > 0]
+    assert torch.equal(noisy.vel, state.vel)
+    assert depth[:, :2].abs().max() == 0
+    assert depth[400:].abs().max() == 0
+    assert len(moved) / 400 == pytest.approx(0.25, abs=0.06)
+    assert moved.mean().item() == pytest.approx(0.5, abs=0.1)
+    assert moved.max() < 1
 
 
 def test_learning_rate_ends_at_the_paper_s_value():
