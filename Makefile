@@ -26,7 +26,7 @@ test: setup
 	$(BIN)/ruff check -q .
 	$(BIN)/ruff format -q --check .
 	$(BIN)/mypy -p gns_pyg -p data_gen
-	$(BIN)/python -m pytest
+	$(BIN)/python -m pytest -n auto --maxprocesses 4 --dist loadfile
 
 results: setup
 	OMP_NUM_THREADS=1 $(BIN)/python -m gns_pyg.results

@@ -17,7 +17,9 @@ from hydra import compose, initialize_config_dir
 from gns_pyg import bundle, run
 from gns_pyg.config import CONF
 from gns_pyg.data.datamodule import open_to_compare
+from gns_pyg.dynamics.projection import nearest_walls
 from gns_pyg.evaluation.predict import initial_state
+from gns_pyg.graph.features import dot
 
 DEPTHS, STEPS, MOST = (0.02, 0.05, 0.1, 0.2, 0.4, 0.8), (1, 4, 8), 60
 TOUCHING = 1.01  # radii
@@ -35,11 +37,9 @@ def main() -> None:
         case = open_to_compare(config.trajectory, simulator.scene)
     state = initial_state(simulator, case, case.n_frames // 2)
     radius = state.radius[0]
-    walls, (point, grain) = simulator.boundary.contacts(state)
-    height = ((state.pos[grain] - walls.pos[point]) * walls.normal[point]).sum(1)
-    chosen = grain[height < TOUCHING * radius].unique()[:MOST]
-    nearest = torch.stack([torch.where(grain == one, height, torch.inf).argmin() for one in chosen])
-    outwards, still = walls.normal[point[nearest]], torch.zeros(len(chosen), 3, dtype=state.vel.dtype)
+    grain, point, normal, _ = nearest_walls(state, *simulator.boundary.contacts(state))
+    at = (dot(state.pos[grain] - point, normal) < TOUCHING * radius).nonzero().flatten()[:MOST]
+    chosen, outwards, still = grain[at], normal[at], torch.zeros(len(at), 3, dtype=state.vel.dtype)
     start = replace(state, vel=state.vel.index_copy(0, chosen, still))
     rows = []
     for depth in DEPTHS:

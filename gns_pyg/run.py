@@ -269,7 +269,7 @@ def build(
             for m, r in ((config, requires), (start.config, start.requires))
         )
         # turned windows and left out edges are matters of training; networks do not know of them
-        elsewhere = ("requires.reasons", "requires.symmetry", "requires.touching_pairs")
+        elsewhere = ("requires.reasons", "requires.symmetry", "requires.touching_pairs", "requires.nearest_points")
         differ = [key for key in sorted({*here, *there}) if here.get(key) != there.get(key)]
         can_gain = start.config.network == "impulse" and not start.requires.material_features
         gained = requires.material_features if can_gain else []

@@ -3,6 +3,7 @@
 from collections.abc import Callable, Iterable, Iterator, Mapping
 from typing import cast
 
+import numpy as np
 import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor, nn
@@ -13,6 +14,8 @@ from gns_pyg.scene.boundary_points import BoundaryPoints
 from gns_pyg.scene.motion import to_body, to_world, turn
 from gns_pyg.scene.scene import Part, Scene
 from gns_pyg.state import State, Walls
+
+SAME_PLANE = 1e-9  # difference of normals, and of offsets over the part's size
 
 
 class BoundaryPart(nn.Module):
@@ -25,18 +28,23 @@ class BoundaryPart(nn.Module):
         scene: gives the frame and the radii.
         config: gives the search backend (see `graph.neighbors`) and how many radii a grain reaches.
         static: build the search structure once; else at every search (only to measure what that costs).
+        nearest: of the points on one plane a grain reaches the nearest only.
     """
 
     pos: Tensor
     normal: Tensor
+    plane: Tensor
 
-    def __init__(self, points: BoundaryPoints, part: Part, scene: Scene, config: ModelConfig, *, static: bool) -> None:
+    def __init__(
+        self, points: BoundaryPoints, part: Part, scene: Scene, config: ModelConfig, *, static: bool, nearest: bool
+    ) -> None:
         super().__init__()
         self.dt_s, self.radii_m = scene.frame_dt_s, scene.grains.radii_m
         self.motion, self.friction_angle_rad = part.motion, part.friction_angle_rad
-        self.config, self.static = config, static
+        self.config, self.static, self.nearest = config, static, nearest
         self.register_buffer("pos", torch.as_tensor(points.pos, dtype=torch.float64))
         self.register_buffer("normal", torch.as_tensor(points.normal, dtype=torch.float64))
+        self.register_buffer("plane", torch.as_tensor(planes(points)), persistent=False)
         self._index: Index | None = None
 
     def _apply(self, fn: Callable[[Tensor], Tensor], recurse: bool = True) -> "BoundaryPart":
@@ -79,7 +87,27 @@ class BoundaryPart(nn.Module):
             self._index = build(self.pos, torch.zeros(len(self.pos), dtype=torch.long, device=self.pos.device))
         body_pos = self.body_pos(state)
         edges = self._index(body_pos, torch.zeros_like(state.batch), self.cutoff_m)
-        return edges if len(self.radii_m) == 1 else edges[:, self.in_reach(body_pos, state.radius, edges)]
+        if len(self.radii_m) > 1:
+            edges = edges[:, self.in_reach(body_pos, state.radius, edges)]
+        return edges[:, self.nearest_on_plane(body_pos, edges)] if self.nearest else edges
+
+    def nearest_on_plane(self, body_pos: Float[Tensor, "n 3"], edges: Int[Tensor, "2 e"]) -> Bool[Tensor, " e"]:
+        """Which [point, grain] are the nearest of the grain's points on that plane; one for each grain and plane."""
+        point, grain = edges
+        order = (self.pos[point] - body_pos[grain]).square().sum(1).argsort(stable=True)
+        place = (grain * len(self.pos) + self.plane[point])[order]
+        place, then = place.sort(stable=True)
+        first = torch.ones_like(place, dtype=torch.bool)
+        first[1:] = place[1:] != place[:-1]
+        return torch.empty_like(first).index_put((order[then],), first)
+
+
+def planes(points: BoundaryPoints) -> np.ndarray:
+    """Which plane each point lies on, (n,)."""
+    size_m = float(np.ptp(points.pos, axis=0).max()) or 1.0
+    offset = (points.normal * points.pos).sum(axis=1) / size_m
+    rounded = np.round(np.column_stack([points.normal, offset]) / SAME_PLANE)
+    return np.unique(rounded, axis=0, return_inverse=True)[1].ravel()
 
 
 class Boundary(nn.Module):
@@ -89,16 +117,22 @@ class Boundary(nn.Module):
         scene: gives the parts.
         points: their points.
         config: see `BoundaryPart`.
-        static: see `BoundaryPart`.
         reachable: only points that a grain reaches are placed in the world; else all of them.
+        options: of every part, see `BoundaryPart`.
     """
 
     def __init__(
-        self, scene: Scene, points: Mapping[str, BoundaryPoints], config: ModelConfig, *, static: bool, reachable: bool
+        self,
+        scene: Scene,
+        points: Mapping[str, BoundaryPoints],
+        config: ModelConfig,
+        *,
+        reachable: bool,
+        **options: bool,
     ) -> None:
         super().__init__()
         self.parts = nn.ModuleList(
-            BoundaryPart(points[name], part, scene, config, static=static) for name, part in scene.boundary.items()
+            BoundaryPart(points[name], part, scene, config, **options) for name, part in scene.boundary.items()
         )
         self.reachable = reachable
 

@@ -127,6 +127,9 @@ class Captured:
             if len(part.radii_m) > 1:
                 ends = torch.stack([point.clamp(max=n_points - 1), grain.clamp(max=n - 1)])
                 kept = kept & part.in_reach(body_pos, state.radius, ends)
+            if part.nearest:
+                ends = torch.stack([point.clamp(max=n_points - 1), grain.clamp(max=n)])
+                kept = kept & part.nearest_on_plane(torch.cat([body_pos, body_pos[:1]]), ends)
             rows = torch.arange(state.n_graphs * n_points, device=device)
             first.append(sum(len(each.pos) for each in placed))
             placed.append(part.at(rows % n_points, state.time_s[rows // n_points]))

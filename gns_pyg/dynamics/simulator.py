@@ -69,8 +69,8 @@ class Simulator(nn.Module):
 
         self.boundary: Boundary | None = None
         if requires.wall_network:
-            static, reachable = requires.static_walls, requires.reachable_points
-            self.boundary = Boundary(scene, points, config, static=static, reachable=reachable)
+            walls = dict(static=requires.static_walls, nearest=requires.nearest_points)
+            self.boundary = Boundary(scene, points, config, reachable=requires.reachable_points, **walls)
         self.grain_network: ContactNetwork | ImpulseNetwork
         self.wall_network: ContactNetwork | ImpulseNetwork | None = None
         if config.network == "impulse":

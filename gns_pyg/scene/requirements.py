@@ -23,6 +23,7 @@ class Requires:
     wall_friction: Union[bool, str] = "auto"
     static_walls: Union[bool, str] = "auto"
     reachable_points: Union[bool, str] = "auto"
+    nearest_points: Union[bool, str] = "auto"
     free_flight: Union[bool, str] = "auto"
     free_grains: Union[bool, str] = "auto"
     touching_pairs: Union[bool, str] = "auto"
@@ -52,6 +53,7 @@ class Requirements:
         static_walls: points are placed and their search structure is built once; a moving part is searched in its
             own frame, where it is static too.
         reachable_points: only boundary points and grains within reach of each other enter the wall network.
+        nearest_points: of the boundary points on one plane, a grain has the nearest only.
         free_flight: the scene's law for a grain that touches nothing is subtracted, not learned.
         free_grains: grains that can touch nothing within the frame follow that law, outside the networks.
         touching_pairs: only pairs (and boundary points) that can touch within the frame exchange anything.
@@ -80,6 +82,7 @@ class Requirements:
     rest: bool = False  # bundles made before have none
     damped: bool = False  # nor this
     touching_pairs: bool = False  # nor this
+    nearest_points: bool = False  # nor this
     reasons: dict[str, str] = field(default_factory=dict)
 
     def __str__(self) -> str:
@@ -124,7 +127,7 @@ def resolve(scene: Scene, parameters: Mapping[str, Sequence[float]], requires: R
     for row, law in (("free_grains", "free_flight"), ("touching_pairs", "free_grains"), ("rest", "free_flight")):
         if getattr(requires, row) == "auto":
             rows[row] = rows[row] and rows[law]
-    for row in ("wall_velocity", "wall_friction", "static_walls", "reachable_points"):
+    for row in ("wall_velocity", "wall_friction", "static_walls", "reachable_points", "nearest_points"):
         carried = rows["wall_network"] or not rows[row]
         require(carried, f"requires.{row}", "true", "a wall network to carry it", "set requires.wall_network=true too")
     flies = rows["free_flight"] or not rows["free_grains"]
@@ -190,6 +193,7 @@ def _derive(scene: Scene, parameters: Mapping[str, Sequence[float]]) -> dict[str
         ),
         "static_walls": (bool(parts), _search(len(parts), len(moving))),
         "reachable_points": (bool(parts), "points and grains out of reach stay out" if parts else "no boundary"),
+        "nearest_points": (False, "only where asked for: of a plane's points all but the nearest stay out"),
         "free_flight": (True, f"gravity {scene.gravity_m_s2} m/s^2 with damping {scene.damping} is known, not learned"),
         "free_grains": (True, "grains that can touch nothing within a frame follow it"),
         "touching_pairs": (False, "only where asked for: pairs that cannot touch within a frame stay out"),

@@ -134,14 +134,13 @@ class TrainingModule(pl.LightningModule):
         if self.simulator.requires.symmetry:
             window = transform(window, self.symmetry, randoms)
         state, frame = self.simulator.integrator.read(window, 1), 1
-        state = perturb(state, self.config, self.simulator, randoms)
+        state, counted = perturb(state, self.config, self.simulator, randoms)
         with torch.no_grad():
             for _ in range(self._own_steps(self._random())):
                 state, frame = self.simulator(state), frame + 1
         following = self.simulator.integrator.read(window, frame + 1)
-        counted = torch.ones_like(state.batch, dtype=torch.bool)
         if window.active is not None and state.active is not None:  # a grain that just entered has no difference yet
-            counted = state.active & window.active[frame - 1 : frame + 2].all(dim=0)
+            counted = counted & state.active & window.active[frame - 1 : frame + 2].all(dim=0)
         if self.config.region_grains is not None:
             core, region = ball(state.pos, state.batch, self.config.region_grains, self.simulator.halo_m, randoms)
             counted = (counted & torch.zeros_like(counted).index_fill(0, core, True))[region]

@@ -199,8 +199,8 @@ DEFECTS = [
     Defect(
         "no noise in training",
         TRAINING,
-        "        state = perturb(state, self.config, self.simulator, randoms)\n",
-        "",
+        "        state, counted = perturb(state, self.config, self.simulator, randoms)\n",
+        "        counted = torch.ones_like(state.batch, dtype=torch.bool)\n",
         ("tests/training/test_module.py::test_noise_is_seen_in_the_loss",),
     ),
     Defect(

@@ -46,6 +46,7 @@ def test_the_step_is_the_simulator_s(scene, n_per_graph) -> None:
         simulators.IMPULSE,
         simulators.TOUCHING,
         {"touching_pairs": True},
+        {"nearest_points": True},
         {"self_loops": True},
         {"free_grains": False},
         {"state": "velocity"},
@@ -56,7 +57,7 @@ def test_the_step_is_the_simulator_s_whatever_the_model(changes) -> None:
     same_step(*model_and_state("drum and box", [80], **changes))
 
 
-@pytest.mark.parametrize("changes", [{}, simulators.IMPULSE])
+@pytest.mark.parametrize("changes", [{}, simulators.IMPULSE, {"nearest_points": True}])
 def test_two_radii(changes) -> None:
     grains = scenes.scene(80, 5).grains
     parts = {"boundary": {"walls": STILL}, "grains": {"count": 80, "radius_m": [0.01, 0.015], "share": [0.5, 0.5]}}
@@ -95,9 +96,12 @@ def test_an_overflow_is_seen_and_the_step_done_again() -> None:
         assert captured.capacities > fitted
 
 
-@pytest.mark.parametrize("scene", ["no boundary", "drum and box", "outlet"])
-def test_a_cuda_graph_can_hold_the_step(scene) -> None:
-    model, state = model_and_state(scene, [90])
+@pytest.mark.parametrize(
+    ("scene", "changes"),
+    [("no boundary", {}), ("drum and box", {}), ("drum and box", {"nearest_points": True}), ("outlet", {})],
+)
+def test_a_cuda_graph_can_hold_the_step(scene, changes) -> None:
+    model, state = model_and_state(scene, [90], **changes)
     for network in (model.grain_network, model.wall_network):
         if network is not None:
             network.sparse = False  # as on a GPU

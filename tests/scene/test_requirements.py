@@ -56,7 +56,7 @@ def test_every_row_can_be_forced(row):
     plain = {"boundary": {}, "gravity_m_s2": [0.0, 0.0, -9.81]}
     if row == "symmetry":
         has_all = {}
-    walled = row in ("wall_velocity", "wall_friction", "static_walls", "reachable_points")
+    walled = row in ("wall_velocity", "wall_friction", "static_walls", "reachable_points", "nearest_points")
     assert getattr(required(forced={row: True} | ({"wall_network": True} if walled else {}), **plain), row)
     if walled:
         with pytest.raises(ConfigError, match="a wall network to carry it"):

@@ -39,8 +39,9 @@ def module():
 def test_noise_is_added_to_a_copy():
     state, training = state_in_box([20]), module()
     before = state.pos.clone(), state.vel.clone(), state.ang_vel.clone()
-    noisy = perturb(state, training.config, training.simulator, [torch.Generator().manual_seed(0)])
+    noisy, counted = perturb(state, training.config, training.simulator, [torch.Generator().manual_seed(0)])
     assert all(torch.equal(a, b) for a, b in zip(before, (state.pos, state.vel, state.ang_vel), strict=True))
+    assert counted.all()
     assert (noisy.pos - state.pos).std().item() == pytest.approx(0.1 * 0.01, rel=0.3)
     assert (noisy.vel - state.vel).std().item() == pytest.approx(0.1 * 0.5, rel=0.3)
 
@@ -49,11 +50,12 @@ def test_that_share_of_the_grains_at_a_wall_starts_in_it():
     """Of 400 grains that lie on a floor and 400 above them."""
     box = {"kind": "box", "size_m": [0.8, 0.8, 0.8], "center_m": [0.0, 0.0, 0.4]}
     scene = scenes.scene(800, 5, boundary={"walls": {"shape": box, "points": 8000, "friction_angle_rad": 0.5}})
-    rows = torch.cartesian_prod(torch.arange(-9.5, 10.0), torch.arange(-9.5, 10.0)).double() * 0.03
+    rows = torch.cartesian_prod(torch.arange(-9.5, 10.0), torch.arange(-9.5, 10.0)).double() * 0.025
     lying, above = (torch.cat([rows, torch.full((400, 1), z).double()], dim=1) for z in (0.01, 0.03))
     state = replace(state_in_box([800]), pos=torch.cat([lying, above]))
     config = TrainingConfig(**CONFIG | {"noise_radii": 0.0, "noise_velocity": 0.0, "noise_in_walls": 0.25})
-    noisy = perturb(state, config, simulator(scene), [torch.Generator().manual_seed(0)])
+    model = simulator(scene)
+    noisy, counted = perturb(state, config, model, [torch.Generator().manual_seed(0)])
     depth = (state.pos - noisy.pos) / 0.01
     moved = depth[:400, 2][depth[:400, 2] > 0]
     assert torch.equal(noisy.vel, state.vel)
@@ -62,6 +64,10 @@ def test_that_share_of_the_grains_at_a_wall_starts_in_it():
     assert len(moved) / 400 == pytest.approx(0.25, abs=0.06)
     assert moved.mean().item() == pytest.approx(0.5, abs=0.1)
     assert moved.max() < 1
+    apart = torch.cdist(state.pos, state.pos[:400][depth[:400, 2] > 0])
+    beside = ((apart > 0) & (apart < model.cutoff_m)).any(1)
+    assert 0 < beside.sum() < 800
+    assert torch.equal(counted, ~beside)
 
 
 def test_learning_rate_ends_at_the_paper_s_value():
