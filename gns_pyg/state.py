@@ -38,6 +38,15 @@ def reached(n: int, *rows: Int[Tensor, " _"]) -> Bool[Tensor, " n"]:
     return found
 
 
+def least_of_each(group: Int[Tensor, " n"], value: Float[Tensor, " n"]) -> Bool[Tensor, " n"]:
+    """Which entries have the least value of their group; of equal ones the first."""
+    order = value.argsort(stable=True)
+    sorted_group, then = group[order].sort(stable=True)
+    first = torch.ones_like(sorted_group, dtype=torch.bool)
+    first[1:] = sorted_group[1:] != sorted_group[:-1]
+    return torch.empty_like(first).index_put((order[then],), first)
+
+
 class Record:
     """A frozen dataclass of tensors that can move between devices."""
 

@@ -11,11 +11,10 @@ from torch import Tensor, nn
 from gns_pyg.dynamics.model_config import ModelConfig
 from gns_pyg.graph.neighbors import Index, backend
 from gns_pyg.scene.boundary_points import BoundaryPoints
+from gns_pyg.scene.mesh import planes
 from gns_pyg.scene.motion import to_body, to_world, turn
 from gns_pyg.scene.scene import Part, Scene
-from gns_pyg.state import State, Walls
-
-SAME_PLANE = 1e-9  # difference of normals, and of offsets over the part's size
+from gns_pyg.state import State, Walls, least_of_each
 
 
 class BoundaryPart(nn.Module):
@@ -44,7 +43,10 @@ class BoundaryPart(nn.Module):
         self.config, self.static, self.nearest = config, static, nearest
         self.register_buffer("pos", torch.as_tensor(points.pos, dtype=torch.float64))
         self.register_buffer("normal", torch.as_tensor(points.normal, dtype=torch.float64))
-        self.register_buffer("plane", torch.as_tensor(planes(points)), persistent=False)
+        if nearest:
+            size_m = float(np.ptp(points.pos, axis=0).max()) or 1.0
+            _, plane = planes(points.normal, points.pos, size_m)
+            self.register_buffer("plane", torch.as_tensor(plane), persistent=False)
         self._index: Index | None = None
 
     def _apply(self, fn: Callable[[Tensor], Tensor], recurse: bool = True) -> "BoundaryPart":
@@ -94,20 +96,8 @@ class BoundaryPart(nn.Module):
     def nearest_on_plane(self, body_pos: Float[Tensor, "n 3"], edges: Int[Tensor, "2 e"]) -> Bool[Tensor, " e"]:
         """Which [point, grain] are the nearest of the grain's points on that plane; one for each grain and plane."""
         point, grain = edges
-        order = (self.pos[point] - body_pos[grain]).square().sum(1).argsort(stable=True)
-        place = (grain * len(self.pos) + self.plane[point])[order]
-        place, then = place.sort(stable=True)
-        first = torch.ones_like(place, dtype=torch.bool)
-        first[1:] = place[1:] != place[:-1]
-        return torch.empty_like(first).index_put((order[then],), first)
-
-
-def planes(points: BoundaryPoints) -> np.ndarray:
-    """Which plane each point lies on, (n,)."""
-    size_m = float(np.ptp(points.pos, axis=0).max()) or 1.0
-    offset = (points.normal * points.pos).sum(axis=1) / size_m
-    rounded = np.round(np.column_stack([points.normal, offset]) / SAME_PLANE)
-    return np.unique(rounded, axis=0, return_inverse=True)[1].ravel()
+        distance = (self.pos[point] - body_pos[grain]).square().sum(1)
+        return least_of_each(grain * len(self.pos) + self.plane[point], distance)
 
 
 class Boundary(nn.Module):

@@ -11,15 +11,14 @@ import torch
 from jaxtyping import Float, Int
 from torch import Tensor, nn
 
-from gns_pyg.scene.mesh import build_mesh
+from gns_pyg.scene.mesh import build_mesh, planes
 from gns_pyg.scene.motion import to_body, to_world, turn
 from gns_pyg.scene.scene import Part, Scene
-from gns_pyg.state import State
+from gns_pyg.state import State, least_of_each
 
 ROUNDS = 3  # walls that a grain may meet in one step, one after the other; then it stays where it was
 LEAST = 0.01  # of a radius: a stopped grain's centre is this high over the wall at least
 EDGE = 1e-9  # of a triangle: its edges are a little wide, so that no line slips between two
-SAME_PLANE = 1e-9  # of the mesh's size
 BLOCK = 2**16  # grains whose sides of all planes are looked at at once
 
 
@@ -98,14 +97,13 @@ class PartGuard(nn.Module):
         self.tolerance_m = EDGE * size
         inwards = -normal if mesh.is_watertight else normal
         offset = (inwards * triangles[:, 0]).sum(axis=1)
-        planes = np.round(np.column_stack([inwards, offset / size]) / SAME_PLANE)
-        _, index, plane = np.unique(planes, axis=0, return_index=True, return_inverse=True)
-        order = np.argsort(plane.ravel(), kind="stable")
+        index, plane = planes(inwards, triangles[:, 0], size)
+        order = np.argsort(plane, kind="stable")
         held = {
             "normal": inwards[index],
             "offset": offset[index],
             "corners": triangles[order],
-            "first": np.searchsorted(plane.ravel()[order], np.arange(len(index) + 1)),
+            "first": np.searchsorted(plane[order], np.arange(len(index) + 1)),
         }
         for key, values in held.items():
             self.register_buffer(key, torch.as_tensor(np.array(values)), persistent=False)
@@ -166,11 +164,7 @@ class PartGuard(nn.Module):
     ) -> tuple[Int[Tensor, " n_met"], Int[Tensor, " n_met"]]:
         """Lines that meet some triangle, and the plane of the first that each meets."""
         grain, plane, part_of_way = self._meetings(start, end)
-        order = torch.argsort(part_of_way, stable=True)
-        order = order[torch.argsort(grain[order], stable=True)]
-        grain, plane = grain[order], plane[order]
-        first = torch.ones_like(grain, dtype=torch.bool)
-        first[1:] = grain[1:] != grain[:-1]
+        first = least_of_each(grain, part_of_way)
         return grain[first], plane[first]
 
     def _meetings(

@@ -13,7 +13,7 @@ from jaxtyping import Int
 from torch import Tensor
 
 from gns_pyg.graph.features import dot
-from gns_pyg.state import State, Walls
+from gns_pyg.state import State, Walls, least_of_each
 
 OVERLAP = 0.002  # of the distance at touch: left alone; DEM's own mean is 0.001 to 0.003 in our scenes
 RELAXATION = 1.5  # of the averaged corrections (Macklin et al. 2014: 1 to 2)
@@ -67,11 +67,6 @@ def nearest_walls(
     """Every grain that has a boundary point in reach, (n,); of the nearest one: place, normal and velocity, (n, 3)."""
     point, grain = contacts
     apart = state.pos.index_select(0, grain) - walls.pos.index_select(0, point)
-    square = dot(apart, apart)
-    least = torch.full_like(state.radius, torch.inf).scatter_reduce(0, grain, square, "amin")
-    chosen = torch.full_like(state.batch, -1)
-    nearest = square == least[grain]
-    chosen[grain[nearest]] = point[nearest]  # any of those at the same distance
-    near = (chosen >= 0).nonzero().flatten()
-    chosen = chosen[near]
+    nearest = least_of_each(grain, dot(apart, apart))
+    near, chosen = grain[nearest], point[nearest]
     return near, walls.pos[chosen], walls.normal[chosen], walls.vel[chosen]

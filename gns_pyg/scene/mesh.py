@@ -17,6 +17,7 @@ from gns_pyg.scene.scene import Part, finite, positive
 
 PACKAGE = Path(CONF).parent
 FARTHEST_M = 1e9
+SAME_PLANE = 1e-9  # of the mesh's size, and of a unit vector
 BLOCK = 20_000  # point-triangle pairs handled at once: few enough to stay in the processor's cache
 
 
@@ -197,6 +198,19 @@ def build_mesh(name: str, part: Part) -> Trimesh:
             )
         mesh.invert()
     return mesh
+
+
+def planes(normal: np.ndarray, pos: np.ndarray, size_m: float) -> tuple[np.ndarray, np.ndarray]:
+    """The planes through points of a mesh, each by the first of its points, (n_planes,); which each point is on, (n,).
+
+    Args:
+        normal, pos: unit vectors and places, (n, 3).
+        size_m: of the mesh: offsets are compared relative to it.
+    """
+    offset = (normal * pos).sum(axis=1) / size_m
+    rounded = np.round(np.column_stack([normal, offset]) / SAME_PLANE)
+    _, first, plane = np.unique(rounded, axis=0, return_index=True, return_inverse=True)
+    return first, plane.ravel()
 
 
 def container(name: str, part: Part) -> Trimesh | None:
