@@ -1,6 +1,7 @@
 """The one kind of small network everything else is made of."""
 
 import itertools
+import math
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from typing import Any
@@ -15,7 +16,9 @@ ONE_DNN = torch.backends.mkldnn.is_available() and hasattr(torch.ops.mkldnn, "_l
 FUSED = {torch.float32} if ONE_DNN else set()  # what oneDNN multiplies here
 if ONE_DNN and torch.ops.mkldnn._is_mkldnn_bf16_supported():
     FUSED.add(torch.bfloat16)
-WIDE = 100  # with gradients, layers from this width on gain more by oneDNN than calling it costs
+# With gradients, layers from this width on gain more by oneDNN than calling it and laying out what is transposed cost;
+# none where vectors are narrow: MKL is as fast there.
+WIDE = 100 if torch.backends.cpu.get_cpu_capability() == "AVX512" else math.inf
 
 
 Parted = tuple[Callable[[Tensor], Tensor], tuple[Tensor, Tensor] | None]
@@ -100,7 +103,7 @@ def linear(layer: nn.Linear, rows: Tensor) -> Tensor:
 
 
 def dense(rows: Tensor, weight: Tensor, bias: Tensor | None = None) -> Tensor:
-    """rows (n, i) @ weight (o, i)^T + bias (o). On a CPU by oneDNN, unless gradients of a narrow layer are wanted."""
+    """rows (n, i) @ weight (o, i)^T + bias (o). On a CPU by oneDNN, unless gradients are wanted and it does not pay."""
     cast = fuses(weight, rows.dtype)
     if cast is None or rows.shape[0] == 0:
         return nn.functional.linear(rows, weight, bias)
@@ -119,8 +122,8 @@ def pays(width: int) -> bool:
 
 
 def product(rows: Tensor, weight: Tensor, bias: Tensor | None = None) -> Tensor:
-    """rows (n, i) @ weight (o, i)^T + bias (o) by oneDNN: on AMD's processors PyTorch's own way, MKL, leaves half of
-    the vector unit idle."""
+    """rows (n, i) @ weight (o, i)^T + bias (o) by oneDNN: of AMD's wide vector units (AVX512) PyTorch's own way, MKL,
+    leaves half idle."""
     if torch.is_grad_enabled():
         return Product.apply(rows, weight, bias)
     # what torch.compile would call, without compiling; not its own "relu", which makes a silent 0 of nan
