@@ -1,4 +1,4 @@
-"""Training goes on from a bundle whose cases were all of one material, with cases of several."""
+"""Training goes on from a bundle: with cases of several materials where it had seen one, or with fewer edges."""
 
 from dataclasses import replace
 from pathlib import Path
@@ -69,6 +69,17 @@ def test_its_scale_is_that_of_the_cases_and_the_others_stay(tmp_path) -> None:
 def test_message_networks_do_not_gain_parameters(tmp_path) -> None:
     with pytest.raises(ConfigError, match=r"material_features = \[\]"):
         gained(tmp_path, "message")
+
+
+@pytest.mark.parametrize("asked", [{"touching_pairs": True}, {"nearest_points": True}])
+def test_edges_may_be_left_out_from_here_on(tmp_path, asked: dict[str, bool]) -> None:
+    scene, trajectories = cases(tmp_path)
+    config = TrainingConfig(**TRAINING, start_from=start(tmp_path, scene, "impulse"))
+    before = bundle.load(config.start_from)
+    requires = replace(before.requires, **asked)
+    after = build(scene, before.config, requires, Split(trajectories, [], [], []), config)
+    assert after.requires == requires != before.requires
+    assert all(torch.equal(value, before.state_dict()[name]) for name, value in after.state_dict().items())
 
 
 def test_climatology_is_of_the_scenes_own_material_where_there_is_such_a_case(tmp_path) -> None:
