@@ -25,7 +25,7 @@ demo: setup
 test: setup
 	$(BIN)/ruff check -q .
 	$(BIN)/ruff format -q --check .
-	$(BIN)/mypy -p gns_pyg -p data_gen
+	$(BIN)/mypy -p gns_pyg -p data_gen -p benchmarks
 	$(BIN)/python -m pytest -n auto --maxprocesses 4 --dist loadfile
 
 results: setup

@@ -79,7 +79,7 @@ def of_neighbors() -> list[tuple[str, float, float]]:
 def of_requirements() -> list[tuple[str, float, float]]:
     rows = [("hopper_small", "reachable_points"), ("drum_small", "free_grains")]
     then = {(row["scene"], row["row"]): row["ms_with"] / row["ms_without"] for row in stored("requirements")}
-    now = {}
+    now: dict[tuple[str, str], float] = {}
     for scene in dict.fromkeys(scene for scene, _ in rows):
         now |= {(row["scene"], row["row"]): row["ms_with"] / row["ms_without"] for row in requirements.of_scene(scene)}
     return [(f"requirements: {' '.join(key)}, with over without", then[key], now[key]) for key in rows]

@@ -35,6 +35,8 @@ def main() -> None:
         case = run.unseen_cases(simulator.scene, None, card, None)[0]
     else:
         case = open_to_compare(config.trajectory, simulator.scene)
+    if simulator.boundary is None:
+        raise SystemExit(f"{simulator.scene.name} has no boundary to be deep in")
     state = initial_state(simulator, case, case.n_frames // 2)
     radius = state.radius[0]
     grain, point, normal, _ = nearest_walls(state, *simulator.boundary.contacts(state))

@@ -39,7 +39,7 @@ def main(system: str, source: str, folder: str) -> None:
     output = running.forward(*running.inputs(graph))
     running.forward_backward(*running.inputs(graph))
     first_s = time.perf_counter() - begin
-    found: dict[str, np.ndarray] = {"output": output, **running.weights("weight"), **running.weights("gradient")}
+    found: dict[str, Any] = {"output": output, **running.weights("weight"), **running.weights("gradient")}
     np.savez(Path(folder) / f"{system}.npz", **found)
     print(json.dumps({"version": running.version, "first_s": first_s}), file=answers)
     random = np.random.default_rng(0)
@@ -55,7 +55,7 @@ def main(system: str, source: str, folder: str) -> None:
 
 def laid_out(parts: list[list[np.ndarray]], order: Order, prefix: str) -> dict[str, np.ndarray]:
     """Arrays by role and number, the MLPs given in the order of `ROLES`, their first layers' columns mended."""
-    found = {}
+    found: dict[str, np.ndarray] = {}
     for role, (first, *rest) in zip(ROLES, parts, strict=True):
         if (wanted := order.get(role.partition(".")[0])) is not None:
             first = np.concatenate([first[:, HIDDEN * k : HIDDEN * (k + 1)] for k in wanted], axis=1)

@@ -94,7 +94,7 @@ def main(arguments: list[str] | None = None) -> None:
     print(table(results))
 
 
-def graph() -> tuple[dict[str, np.ndarray], str]:
+def graph() -> tuple[dict[str, Any], str]:
     """Node and edge features, senders and receivers (by receiver, then by sender): the nearest pairs, both ways,
     every node in one of them."""
     if CASE.is_file():

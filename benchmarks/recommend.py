@@ -76,4 +76,4 @@ def compared(row: Any, again: dict[str, Any], now_s: float) -> dict[str, Any]:
 
 
 if __name__ == "__main__":
-    main(*(sys.argv[1:] or [None]))
+    main(sys.argv[1] if sys.argv[1:] else None)

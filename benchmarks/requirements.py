@@ -27,9 +27,12 @@ from gns_pyg.dynamics.simulator import Simulator
 from gns_pyg.scene.requirements import Requires, resolve
 from gns_pyg.scene.scene import Scene
 from gns_pyg.state import State
+from gns_pyg.training.config import TrainingConfig
 
-SCENES = ("hopper_small", "drum_small", "pile", "free", "inclined_drum", "hopper_discharge", "silo_stl")
-SCENES += ("drum_bidisperse", "hopper_friction")
+SCENES = (
+    *("hopper_small", "drum_small", "pile", "free", "inclined_drum", "hopper_discharge", "silo_stl"),
+    *("drum_bidisperse", "hopper_friction"),
+)
 ROWS = {  # row -> whether leaving it out changes nothing at all
     "wall_network": True,
     "wall_velocity": True,
@@ -62,11 +65,12 @@ def of_scene(name: str) -> list[dict[str, Any]]:
     with initialize_config_dir(CONF, version_base="1.3"):
         config = compose("train", [f"scene={name}", "model=contact"])
     scene, model = Scene.from_config(config.scene), typed(ModelConfig, config.model, "model")
+    training = typed(TrainingConfig, config.training, "training")
     cases = [open_case(path, scene) for path in find_cases(scene, None)[:3]]
     seen = values(cases)
 
-    def simulator(**forced: bool) -> Simulator:
-        return run.build(scene, model, resolve(scene, seen, Requires(**forced)), Split(cases, [], []), seed=0).eval()
+    def simulator(**forced: Any) -> Simulator:
+        return run.build(scene, model, resolve(scene, seen, Requires(**forced)), Split(cases, [], []), training).eval()
 
     own = simulator()
     case = cases[0]
