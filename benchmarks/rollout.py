@@ -3,14 +3,14 @@ r"""Full-size roll-outs against Yade on the same two cores: `python -m benchmark
 Yade runs a case of the paper's hopper and drum with two threads, at the paper's 1e-5 s and at its largest step that
 still gives the same observables (`scene.dem.dt_s=auto`); the last files are kept in $GNS_DATA/rollout_benchmark. Then
 every bundle of MODELS rolls the second one out, on two threads, and is judged against it. Times are medians of three,
-but for Yade's at 1e-5 s, which is one run of many minutes. Half an hour to an hour. Writes
+but for Yade's at 1e-5 s, which is one run of many minutes. About an hour. Writes
 benchmarks/results/rollout.json. One row is the full-size bundle that ships, one goes on from it on longer frames
 (docs/tradeoff.md, "At full size"); the others are trained on the reduced scenes first (128touching with
 requires.touching_pairs=true; a row whose bundle is missing is left out, and bfloat16 where the processor lacks it, but
 for the first, whose factors stand for the scene), for example
 
-    python train.py scene=hopper_small model=contact model.hidden=128 training.updates=1500 \
-        hydra.run.dir=runs/speed/hopper_128
+    python train.py scene=hopper_small model=contact model.hidden=128 training.updates=2000 \
+        training.noise_in_walls=0.05 hydra.run.dir=runs/speed/hopper_128
     python train.py scene=hopper_small model=contact model.hidden=32 model.layers=1 scene.frame_dt_s=0.02 \
         hydra.run.dir=runs/speed/hopper_fast20
 """
