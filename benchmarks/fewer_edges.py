@@ -18,17 +18,11 @@ from statistics import mean
 from typing import Any
 
 import torch
-from hydra import compose, initialize_config_dir
 
 from benchmarks.requirements import n_edges, timed
-from gns_pyg import machine, run
-from gns_pyg.config import CONF, typed
-from gns_pyg.data.datamodule import Split, find_cases, open_case
+from benchmarks.untrained import untrained
+from gns_pyg import machine
 from gns_pyg.data.windows import read_window
-from gns_pyg.dynamics.model_config import ModelConfig
-from gns_pyg.scene.requirements import Requires, resolve
-from gns_pyg.scene.scene import Scene
-from gns_pyg.training.config import TrainingConfig
 
 OUT = Path(__file__).parent / "results" / "fewer_edges.json"
 WAYS: dict[str, dict[str, Any]] = {
@@ -42,15 +36,9 @@ STATES = 8
 
 def main() -> None:
     torch.set_num_threads(1)
-    with initialize_config_dir(CONF, version_base="1.3"):
-        config = compose("train", sys.argv[1:])
-    scene, model = Scene.from_config(config.scene), typed(ModelConfig, config.model, "model")
-    training = typed(TrainingConfig, config.training, "training")
-    case = open_case(find_cases(scene, config.data.dir)[0], scene)
-    simulators = [
-        run.build(scene, model, resolve(scene, {}, Requires(**forced)), Split([case], [], []), training).eval()
-        for forced in WAYS.values()
-    ]
+    (case,), simulator_with = untrained(*sys.argv[1:])
+    simulators = [simulator_with(**forced) for forced in WAYS.values()]
+    scene, model = simulators[0].scene, simulators[0].config
     frames = torch.linspace(0, case.n_frames - 3, STATES).long().tolist()
     states = [simulators[0].integrator.read(read_window(case, frame, 3), 1) for frame in frames]
     ms = timed([(simulator, states) for simulator in simulators])

@@ -19,23 +19,17 @@ from typing import Any
 from unittest.mock import patch
 
 import torch
-from hydra import compose, initialize_config_dir
 
-from gns_pyg import machine, run
-from gns_pyg.config import CONF, typed
-from gns_pyg.data.datamodule import Split, find_cases, open_case
+from benchmarks.untrained import untrained
+from gns_pyg import machine
 from gns_pyg.data.windows import read_window
 from gns_pyg.dynamics import simulator as steps
 from gns_pyg.dynamics.boundary import BoundaryPart
 from gns_pyg.dynamics.integrator import Integrator
-from gns_pyg.dynamics.model_config import ModelConfig
 from gns_pyg.dynamics.simulator import Simulator
 from gns_pyg.evaluation.predict import perturbed
 from gns_pyg.graph import features
-from gns_pyg.scene.requirements import Requires, resolve
-from gns_pyg.scene.scene import Scene
 from gns_pyg.state import State
-from gns_pyg.training.config import TrainingConfig
 
 OUT = Path(__file__).parent / "results" / "phases.json"
 PHASES: dict[str, list[tuple[Any, str]]] = {
@@ -107,13 +101,8 @@ def timed(function: Callable, spent: dict[str, float], phase: str) -> Callable:
 
 def paper_wide(name: str, *frames: int) -> tuple[Any, ...]:
     """An untrained simulator of width 128 and recorded states of a scene."""
-    with initialize_config_dir(CONF, version_base="1.3"):
-        config = compose("train", [f"scene={name}", "model=contact", "model.hidden=128"])
-    scene = Scene.from_config(config.scene)
-    case = open_case(find_cases(scene, None)[0], scene)
-    requires = resolve(scene, {}, Requires())
-    model, training = typed(ModelConfig, config.model, "model"), typed(TrainingConfig, config.training, "training")
-    simulator = run.build(scene, model, requires, Split([case], [], []), training).eval()
+    (case,), simulator_of = untrained(f"scene={name}", "model=contact", "model.hidden=128")
+    simulator = simulator_of()
     return simulator, *(simulator.integrator.read(read_window(case, frame, 2), 1) for frame in frames)
 
 

@@ -14,20 +14,12 @@ from statistics import mean
 from typing import Any
 
 import torch
-from hydra import compose, initialize_config_dir
 
-from gns_pyg import run
-from gns_pyg.config import CONF, typed
-from gns_pyg.data.coverage import values
-from gns_pyg.data.datamodule import Split, find_cases, open_case
+from benchmarks.untrained import untrained
 from gns_pyg.data.trajectory import Trajectory
 from gns_pyg.data.windows import read_window
-from gns_pyg.dynamics.model_config import ModelConfig
 from gns_pyg.dynamics.simulator import Simulator
-from gns_pyg.scene.requirements import Requires, resolve
-from gns_pyg.scene.scene import Scene
 from gns_pyg.state import State
-from gns_pyg.training.config import TrainingConfig
 
 SCENES = (
     *("hopper_small", "drum_small", "pile", "free", "inclined_drum", "hopper_discharge", "silo_stl"),
@@ -62,19 +54,9 @@ def main() -> None:
 
 def of_scene(name: str) -> list[dict[str, Any]]:
     """The rows that the scene does without, and what each saves."""
-    with initialize_config_dir(CONF, version_base="1.3"):
-        config = compose("train", [f"scene={name}", "model=contact"])
-    scene, model = Scene.from_config(config.scene), typed(ModelConfig, config.model, "model")
-    training = typed(TrainingConfig, config.training, "training")
-    cases = [open_case(path, scene) for path in find_cases(scene, None)[:3]]
-    seen = values(cases)
-
-    def simulator(**forced: Any) -> Simulator:
-        return run.build(scene, model, resolve(scene, seen, Requires(**forced)), Split(cases, [], []), training).eval()
-
+    (case, *_), simulator = untrained(f"scene={name}", "model=contact", first=3)
     own = simulator()
-    case = cases[0]
-    last, early = case.n_frames - 3, int(EARLY_S / scene.frame_dt_s) - 1
+    last, early = case.n_frames - 3, int(EARLY_S / own.scene.frame_dt_s) - 1
     rows = []
     for row, exact in ROWS.items():
         row, _, when = row.partition(" ")

@@ -10,31 +10,20 @@ import sys
 from pathlib import Path
 
 import torch
-from hydra import compose, initialize_config_dir
 
-from gns_pyg import run
-from gns_pyg.config import CONF, typed
-from gns_pyg.data.datamodule import Split, find_cases, open_case
+from benchmarks.untrained import untrained
 from gns_pyg.data.windows import read_window
 from gns_pyg.dynamics.free_grains import can_meet
-from gns_pyg.dynamics.model_config import ModelConfig
-from gns_pyg.scene.requirements import Requires, resolve
-from gns_pyg.scene.scene import Scene
 from gns_pyg.state import State
-from gns_pyg.training.config import TrainingConfig
 
 MARGINS, STATES = (0.02, 0.05, 0.1, 0.2), 40
 OUT = Path(__file__).parent / "results" / "touching_pairs.json"
 
 
 def main() -> None:
-    with initialize_config_dir(CONF, version_base="1.3"):
-        config = compose("train", sys.argv[1:])
-    scene = Scene.from_config(config.scene)
-    case = open_case(find_cases(scene, config.data.dir)[0], scene)
-    model, training = typed(ModelConfig, config.model, "model"), typed(TrainingConfig, config.training, "training")
-    requires = resolve(scene, {}, Requires(free_grains=False))
-    simulator = run.build(scene, model, requires, Split([case], [], []), training).eval()
+    (case,), simulator_with = untrained(*sys.argv[1:])
+    simulator = simulator_with(free_grains=False)
+    scene = simulator.scene
     pairs, kept = 0, dict.fromkeys(MARGINS, 0)
     contacts, missed = 0, dict.fromkeys((None, *MARGINS), 0)
     for frame in range(1, case.n_frames - 2, max(1, case.n_frames // STATES)):
