@@ -42,7 +42,7 @@ def card_page(description: Mapping[str, Any], metrics: Mapping[str, Any] | None 
         "## Scene\n",
         *_table(("what", "value"), _scene(scene)),
         "\n## Data\n",
-        *_table(("cases", "files"), _cases(card.get("cases", {}))),
+        *_table(("cases", "files"), _cases(card)),
         "\n## Validity range\n",
         "What the training cases cover. Outside of it a roll-out or evaluation warns; its errors are unknown there.\n",
         *_table(("what", "lowest", "highest"), _coverage(card)),
@@ -73,12 +73,20 @@ def _scene(scene: Mapping[str, Any]) -> list[tuple[str, str]]:
     ]
 
 
-def _cases(cases: Mapping[str, Any]) -> list[tuple[str, str]]:
-    names = {"train": "trained on", "val": "validated on", "test": "kept unseen"}
+def _cases(card: Mapping[str, Any]) -> list[tuple[str, str]]:
+    cases, names = card.get("cases", {}), {"train": "trained on", "val": "validated on", "test": "kept unseen"}
     rows = [(text, ", ".join(cases[key])) for key, text in names.items() if cases.get(key)]
     if answers := cases.get("answers"):
         rows.insert(1, ("trained on, DEM's answers to its own states", f"{len(answers)} files"))
+    if others := seen_earlier(card):
+        rows.append(("trained on earlier, before training.start_from", f"{others} others"))
     return rows
+
+
+def seen_earlier(card: Mapping[str, Any]) -> int:
+    """How many cases its weights had seen, beside its own, in the bundle that training started from."""
+    own = sum(len(card["cases"].get(purpose, {})) for purpose in ("train", "val")) if "cases" in card else 0
+    return max(0, len(card.get("starts", [])) - own)
 
 
 def _coverage(card: Mapping[str, Any]) -> list[tuple[str, str, str]]:

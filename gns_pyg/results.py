@@ -13,7 +13,7 @@ import numpy as np
 
 from gns_pyg import bundle, machine
 from gns_pyg.card import FILE as CARD
-from gns_pyg.card import card_page
+from gns_pyg.card import card_page, seen_earlier
 from gns_pyg.data.coverage import seen
 from gns_pyg.data.datamodule import find_cases, open_condition, open_to_compare
 from gns_pyg.data.trajectory import Trajectory
@@ -82,7 +82,7 @@ def results(docs: Path, names: Sequence[str] = REDUCED) -> dict[str, Any]:
             "metrics": evaluation.metrics | {"speed/device": machine.processor()},
             "spread": spread(evaluation.per_case),
             "cases": evaluation.per_case,
-            "trained_on": len(card["cases"]["train"]),
+            "trained_on": len(card["cases"]["train"]) + seen_earlier(card),
             "seed_scatter": seed_scatter(of_material(own, scene), scene),
             "ensemble": ensemble_of(name, simulator, unseen[0], docs / "figures"),
             "long": long_runs(name, scene),

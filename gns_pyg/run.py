@@ -20,7 +20,7 @@ from torch import nn
 
 from gns_pyg import bundle, machine
 from gns_pyg.config import check_keys, flat, plain, require, typed
-from gns_pyg.data.coverage import coverage, outside_coverage, seen, values
+from gns_pyg.data.coverage import coverage, outside_coverage, seen, starts, values
 from gns_pyg.data.datamodule import DataConfig, DataModule, Split, find_cases, open_to_compare, split
 from gns_pyg.data.statistics import measure, scales_of_parameters
 from gns_pyg.data.trajectory import Trajectory
@@ -70,7 +70,12 @@ def train(cfg: DictConfig) -> dict[str, Any]:
     if done is None:  # the first process judges and writes
         return {}
     simulator, cases, expected, card, trainer = done
-    unseen = [open_to_compare(case.path, simulator.scene, cfg.compare_every_s) for case in cases.test]
+    kept = [open_to_compare(case.path, simulator.scene, cfg.compare_every_s) for case in cases.test]
+    unseen = [case for case in kept if not seen(case, simulator.scene, card)]
+    if len(unseen) < len(kept):
+        log.warning(
+            "%d of %d test cases left out: training.start_from has seen them", len(kept) - len(unseen), len(kept)
+        )
     metrics = judge_and_report(simulator, unseen, expected, cfg, folder / "bundle", card, trainer)
     close(trainer.loggers)
     bundle.save(folder / "bundle", simulator, strict(card | {"metrics": metrics}))
@@ -140,7 +145,8 @@ def trained(cfg: DictConfig) -> tuple[Simulator, Split, Climatology, dict[str, A
     card = {"cases": used, "training": plain(cfg.training), "climatology": asdict(expected)}
     card["cost"] = cost(cases, training, timer.time_elapsed("train"), where)
     card["coverage"] = coverage(scene, cases.train)
-    card["starts"] = [case.start() for case in (*cases.train, *cases.val)]
+    before = bundle.card(training.start_from) if training.start_from else {}
+    card["starts"] = starts([*cases.train, *cases.val], scene, before.get("starts", []))
     bundle.save(folder / "bundle", simulator, strict(card))
     return simulator, cases, expected, card, trainer
 
@@ -455,8 +461,8 @@ def report(
 
 
 def cost(cases: Split, training: TrainingConfig, seconds: float, where: torch.device) -> dict[str, Any]:
-    """What a bundle has cost: Yade for all it learned from, s, and training, wall s (None where the bundle that it
-    started from does not say)."""
+    """What a bundle has cost: Yade for the cases of this training, s, and all training, wall s (None where the bundle
+    that it started from does not say)."""
     start = training.start_from and bundle.card(training.start_from).get("cost", {"training_s": None})
     earlier = start["training_s"] if start else 0.0
     learned = (*cases.train, *cases.val, *cases.answers)

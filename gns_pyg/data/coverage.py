@@ -86,8 +86,17 @@ def seen(case: Trajectory, scene: Scene, card: Mapping[str, Any]) -> bool:
     """Whether a bundle of this card was trained or validated on a case: on its content or, however it was recorded, on
     a case of the same start."""
     digests = {digest for purpose in ("train", "val") for digest in card["cases"][purpose].values()}
-    starts = [np.array(start) for start in card.get("starts", [])]  # bundles made before have none
+    return case.content_hash() in digests or _among(case.start(), card.get("starts", []), scene)
+
+
+def starts(cases: Sequence[Trajectory], scene: Scene, earlier: Sequence[Any]) -> list[Any]:
+    """The starts of the cases that a bundle is trained and validated on, and, each once, the `earlier` ones of the
+    bundle whose weights that training went on from: weights do not forget."""
+    own = [case.start() for case in cases]
+    return own + [start for start in earlier if not _among(np.array(start), own, scene)]
+
+
+def _among(start: np.ndarray, others: Sequence[Any], scene: Scene) -> bool:
     within_m = SAME_START * scene.grains.radii_m[0]
-    own = case.start()
-    same = (own.shape == start.shape and np.abs(own - start).max() < within_m for start in starts)
-    return case.content_hash() in digests or any(same)
+    arrays = (np.array(other) for other in others)
+    return any(start.shape == other.shape and np.abs(start - other).max() < within_m for other in arrays)

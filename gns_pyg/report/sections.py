@@ -7,6 +7,7 @@ from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
+from gns_pyg.card import seen_earlier
 from gns_pyg.errors import DataError
 from gns_pyg.evaluation.ensemble import SHIFT_M, Ensemble
 from gns_pyg.report.cost import break_even
@@ -124,7 +125,9 @@ def trained_on(card: Mapping[str, Any]) -> str:
     """How many cases a bundle has seen, and for what."""
     counts = {purpose: len(files) for purpose, files in card["cases"].items()}
     answers = f" and {counts['answers']} files of answers" if counts.get("answers") else ""
-    return f"{counts['train']} case{'' if counts['train'] == 1 else 's'}{answers}, {counts['val']} for validation"
+    others = f"; earlier on {seen_earlier(card)} others" if seen_earlier(card) else ""
+    cases = f"{counts['train']} case{'' if counts['train'] == 1 else 's'}{answers}"
+    return f"{cases}, {counts['val']} for validation{others}"
 
 
 def config(text: str) -> str:

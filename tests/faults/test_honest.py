@@ -7,6 +7,7 @@ import pytest
 import torch
 
 from gns_pyg import bundle, run
+from gns_pyg.card import seen_earlier
 from gns_pyg.data.datamodule import EMBEDDED, DataConfig, open_to_compare, split
 from gns_pyg.data.statistics import measure
 from gns_pyg.dynamics.integrator import Integrator
@@ -14,6 +15,7 @@ from gns_pyg.errors import ConfigError, DataError
 from gns_pyg.evaluation.judge import judge
 from gns_pyg.evaluation.metrics import write_json
 from gns_pyg.evaluation.twins import read_twins, twins_path
+from gns_pyg.report.sections import trained_on
 from gns_pyg.results import BUNDLES, REDUCED, kept_for_testing, long_runs, own_cases
 from gns_pyg.scene.scene import Scene
 from tests.faults import samples
@@ -102,6 +104,25 @@ def test_resuming_with_other_data_is_refused_and_the_difference_named(data, tmp_
     (data / "case_000.h5").rename(data / "case_009.h5")
     with pytest.raises(ConfigError, match=r"cases\.train\.case_009\.h5"):
         samples.train(data, tmp_path / "a")
+
+
+def test_what_training_started_from_has_seen_does_not_judge(data, tmp_path, caplog):
+    """Weights do not forget: a bundle that goes on from another knows that one's cases, too."""
+    samples.train(data, tmp_path / "one")
+    (tmp_path / "few").mkdir()
+    for name in ("scene.yaml", "case_000.h5", "case_002.h5"):
+        shutil.copyfile(data / name, tmp_path / "few" / name)
+    start = f"training.start_from={tmp_path / 'one' / 'bundle'}"
+    samples.train(tmp_path / "few", tmp_path / "two", start, "data.test_fraction=0.5")
+    assert "1 of 1 test cases left out" in caplog.text
+    assert (tmp_path / "two" / "metrics.json").read_text().strip() == "{}"
+    card = bundle.card(tmp_path / "two" / "bundle")
+    assert len(card["starts"]) == 5
+    assert seen_earlier(card) == 4
+    assert "earlier on 4 others" in trained_on(card)
+    assert "| 4 others |" in (tmp_path / "two" / "bundle" / "card.md").read_text()
+    used = [f"bundle={tmp_path / 'two' / 'bundle'}", f"data.dir={data}", "start_s=0.02"]
+    assert run.evaluate(samples.config("evaluate", tmp_path / "three", None, *used)) == {}
 
 
 def test_resuming_with_other_data_workers_gives_the_same_sequence(data, tmp_path):
