@@ -128,6 +128,7 @@ def trained(cfg: DictConfig) -> tuple[Simulator, Split, Climatology, dict[str, A
     identity |= {f"scene.boundary.{name}.points": part.points for name, part in scene.boundary.items()}
     identity["scene.seed"] = scene.seed  # of the boundary points
     del identity["training.updates"]  # a run may be lengthened
+    begun = {key: value.clone() for key, value in simulator.state_dict().items()}
     module = TrainingModule(simulator, training, identity)
     resume_from = cfg.ckpt_path
     if resume_from is None and (last := folder / "checkpoints" / "last.ckpt").is_file():
@@ -141,6 +142,10 @@ def trained(cfg: DictConfig) -> tuple[Simulator, Split, Climatology, dict[str, A
     if not trainer.is_global_zero:
         return None
     simulator = module.judged.eval().to(where)
+    if training.start_share:
+        with torch.no_grad():
+            for name, weights in simulator.named_parameters():
+                weights.lerp_(begun[name].to(where), training.start_share)
     expected = climatology(cases.train, scene)
     card = {"cases": used, "training": plain(cfg.training), "climatology": asdict(expected)}
     card["cost"] = cost(cases, training, timer.time_elapsed("train"), where)

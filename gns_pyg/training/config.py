@@ -32,6 +32,8 @@ class TrainingConfig:
             grain's own error is smallest for an average motion, which loses speed at every step.) 0 leaves it out.
         start_from: a bundle whose weights and scales training starts from; null draws and measures them. Parameters
             that vary here, where none did there, become inputs (impulse networks).
+        start_share: what is judged and saved is this share of the weights of `start_from` and the rest of the trained
+            ones (Wortsman et al. 2022, "Robust fine-tuning of zero-shot models"); 0 is the trained ones.
         average_decay: the weights' exponential moving average with this decay is what is judged and saved; 0 is none.
     """
 
@@ -49,6 +51,7 @@ class TrainingConfig:
     loss_knee: float = MISSING
     balance: float = MISSING
     start_from: str | None = None
+    start_share: float = 0.0
     region_grains: int | None = None
     average_decay: float = MISSING
 
@@ -72,6 +75,9 @@ class TrainingConfig:
             require(value >= 0, f"training.{key}", value, "at least 0", f"training.{key}=0 turns it off")
         most = self.noise_in_walls
         require(most <= 1, "training.noise_in_walls", most, "0 to 1", "it is a share of grains")
+        share, known = self.start_share, self.start_from is not None
+        require(0 <= share < 1, "training.start_share", share, "0 up to below 1", "e.g. 0.5")
+        require(not share or known, "training.start_share", share, "0 without training.start_from", "name a bundle")
         region = self.region_grains
         require(region is None or region > 0, "training.region_grains", region, "at least 1", "null takes all grains")
         decay = self.average_decay

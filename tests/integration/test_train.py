@@ -115,6 +115,18 @@ def test_a_bundle_that_goes_on_from_another_costs_both(trained, tmp_path):
     assert cost(tmp_path / "b")["training_s"] is None
 
 
+def test_a_share_of_the_old_weights_stays(trained, tmp_path):
+    start = ["experiment=hopper", "training.updates=2", f"training.start_from={trained[0] / 'bundle'}"]
+    train(tmp_path / "new", *start)
+    train(tmp_path / "kept", *start, "training.start_share=0.25")
+    old, new, kept = (weights(folder) for folder in (trained[0], tmp_path / "new", tmp_path / "kept"))
+    assert any(not torch.equal(old[key], new[key]) for key in old)
+    for key in old:
+        torch.testing.assert_close(kept[key], 0.25 * old[key] + 0.75 * new[key], rtol=1e-5, atol=1e-7)
+    with pytest.raises(ConfigError, match=r"training\.start_share"):
+        train(tmp_path / "none", "experiment=hopper", "training.start_share=0.5")
+
+
 def test_bundle_equals_checkpoint(trained):
     """The bundle holds the averaged weights of the last checkpoint."""
     checkpoint = torch.load(trained[0] / "checkpoints" / "last.ckpt", weights_only=True)["state_dict"]
