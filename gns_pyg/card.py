@@ -85,8 +85,8 @@ def _cases(card: Mapping[str, Any]) -> list[tuple[str, str]]:
 
 def seen_earlier(card: Mapping[str, Any]) -> int:
     """How many cases its weights had seen, beside its own, in the bundle that training started from."""
-    own = sum(len(card["cases"].get(purpose, {})) for purpose in ("train", "val")) if "cases" in card else 0
-    return max(0, len(card.get("starts", [])) - own)
+    cases = card.get("cases", {})
+    return max(0, len(card.get("starts", [])) - len(cases.get("train", {})) - len(cases.get("val", {})))
 
 
 def _coverage(card: Mapping[str, Any]) -> list[tuple[str, str, str]]:

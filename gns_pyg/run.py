@@ -70,12 +70,7 @@ def train(cfg: DictConfig) -> dict[str, Any]:
     if done is None:  # the first process judges and writes
         return {}
     simulator, cases, expected, card, trainer = done
-    kept = [open_to_compare(case.path, simulator.scene, cfg.compare_every_s) for case in cases.test]
-    unseen = [case for case in kept if not seen(case, simulator.scene, card)]
-    if len(unseen) < len(kept):
-        log.warning(
-            "%d of %d test cases left out: training.start_from has seen them", len(kept) - len(unseen), len(kept)
-        )
+    unseen = [open_to_compare(case.path, simulator.scene, cfg.compare_every_s) for case in cases.test]
     metrics = judge_and_report(simulator, unseen, expected, cfg, folder / "bundle", card, trainer)
     close(trainer.loggers)
     bundle.save(folder / "bundle", simulator, strict(card | {"metrics": metrics}))
@@ -103,7 +98,12 @@ def trained(cfg: DictConfig) -> tuple[Simulator, Split, Climatology, dict[str, A
         "0: answers are single frames, and tell what own steps would",
         "set training.unroll=0",
     )
-    cases = split(scene, data)
+    cases, before = split(scene, data), bundle.card(training.start_from) if training.start_from else {}
+    if before:
+        unseen = [case for case in cases.test if not seen(case, scene, before)]
+        if left_out := len(cases.test) - len(unseen):
+            log.warning("%d of %d test cases left out: training.start_from has seen them", left_out, len(cases.test))
+        cases = replace(cases, test=unseen)
     requires = resolve(scene, values(cases.train), forced)
     log.info("what the scene requires (requires.<row> forces one):\n%s", requires)
     for case in (*cases.val, *cases.test):
@@ -148,9 +148,8 @@ def trained(cfg: DictConfig) -> tuple[Simulator, Split, Climatology, dict[str, A
                 weights.lerp_(begun[name].to(where), training.start_share)
     expected = climatology(cases.train, scene)
     card = {"cases": used, "training": plain(cfg.training), "climatology": asdict(expected)}
-    card["cost"] = cost(cases, training, timer.time_elapsed("train"), where)
+    card["cost"] = cost(cases, before, timer.time_elapsed("train"), where)
     card["coverage"] = coverage(scene, cases.train)
-    before = bundle.card(training.start_from) if training.start_from else {}
     card["starts"] = starts([*cases.train, *cases.val], scene, before.get("starts", []))
     bundle.save(folder / "bundle", simulator, strict(card))
     return simulator, cases, expected, card, trainer
@@ -465,11 +464,10 @@ def report(
     return metrics
 
 
-def cost(cases: Split, training: TrainingConfig, seconds: float, where: torch.device) -> dict[str, Any]:
-    """What a bundle has cost: Yade for the cases of this training, s, and all training, wall s (None where the bundle
-    that it started from does not say)."""
-    start = training.start_from and bundle.card(training.start_from).get("cost", {"training_s": None})
-    earlier = start["training_s"] if start else 0.0
+def cost(cases: Split, before: dict[str, Any], seconds: float, where: torch.device) -> dict[str, Any]:
+    """What a bundle has cost: Yade for the cases of this training, s, and all training, wall s (None where the card
+    `before`, of the bundle that it started from, does not say)."""
+    earlier = before.get("cost", {"training_s": None})["training_s"] if before else 0.0
     learned = (*cases.train, *cases.val, *cases.answers)
     return {
         "dem_s": sum(dem_seconds(case.run) for case in learned),
