@@ -109,7 +109,7 @@ def heap_case(path: Path, kind: str, angle_deg: float, n_frames: int = 12, n_in_
         kind: `plane` (a wedge that rises along y, the axis along x) or `radial` (a cone about z).
         n_in_flight: grains that hang in the air over the bed and are no part of it.
     """
-    step, slope = 2 * RADIUS_M, np.tan(np.radians(angle_deg))
+    step, slope = 1.9 * RADIUS_M, np.tan(np.radians(angle_deg))  # neighbours along the slope touch
     ticks = step * np.arange(-6, 7)
     x, y = (grid.ravel() for grid in np.meshgrid(ticks, ticks))
     top = slope * y if kind == "plane" else -slope * np.hypot(x, y)

@@ -18,7 +18,8 @@ from gns_pyg.scene.scene import Scene
 from gns_pyg.scene.symmetry import up_direction
 
 CELL_DIAMETERS = 1.5  # edge of the surface's cells; 1 to 2 read the same angle, 1.5 with the least scatter
-BED_GAP_DIAMETERS = 1.25  # grains nearer than this belong together: the paper's cutoff, 2.5 radii
+DRUM_GAP_DIAMETERS = 1.25  # grains nearer than this belong together (a flowing bed is loose): the paper's 2.5 radii
+HEAP_GAP_DIAMETERS = 1.05  # a heap's grains touch; a jet that falls onto it is dense enough for the drum's gap
 CENTRAL_SHARE = 0.75  # of the bed's width across the drum; the surface bends towards the mantle beyond it
 
 
@@ -51,12 +52,13 @@ def outflow(pos: np.ndarray) -> np.ndarray:
 def angle_of_repose(pos: np.ndarray, scene: Scene) -> np.ndarray:
     """Angle of the bed's free surface against the horizontal, per frame.
 
-    Only grains of the bed count: the largest cluster of grains nearer than 1.25 diameters to each other, so that a
-    grain in flight or an escaped one does not pose as surface. The horizontal plane is divided into square cells of
-    1.5 grain diameters, the highest grain of each cell is the surface (the radius that lies between its centre and
-    its top is the same everywhere and leaves the slope as it is), and a least-squares line through the heights of
-    these grains gives the angle. Cells of equal area matter: the highest of many grains is higher than the highest
-    of few, so that whole annuli of a heap, which grow outwards, would read several degrees too flat.
+    Only grains of the bed count, so that those in flight, in a jet or outside do not pose as surface: the largest
+    cluster of grains nearer to each other than 1.25 diameters (a drum) or 1.05 (a heap). The horizontal plane is
+    divided into square cells of 1.5 grain diameters, the highest grain of each cell is the surface (the radius that
+    lies between its centre and its top is the same everywhere and leaves the slope as it is), and a least-squares line
+    through the heights of these grains gives the angle. Cells of equal area matter: the highest of many grains is
+    higher than the highest of few, so that whole annuli of a heap, which grow outwards, would read several degrees too
+    flat.
 
     `plane` (a drum): height against the horizontal coordinate across the axis; the middle half of the bed's grains
     along the axis and the central 75 % of the bed's width are read (away from end caps and mantle); unsigned.
@@ -82,7 +84,8 @@ def angle_of_repose(pos: np.ndarray, scene: Scene) -> np.ndarray:
         return np.array([np.degrees(np.arctan(abs(surface_slope(frame[present(frame)], scene)))) for frame in pos])
     if definition.kind == "radial":
         radius, middle, up = scene.grains.radii_m[-1], _boundary_middle(scene), up_direction(scene)
-        return np.array([_radial_angle(_bed(frame[present(frame)], radius), middle, up, radius) for frame in pos])
+        beds = (_bed(frame[present(frame)], HEAP_GAP_DIAMETERS * 2 * radius) for frame in pos)
+        return np.array([_radial_angle(bed, middle, up, radius) for bed in beds])
     raise ConfigError("scene.angle_of_repose.kind", definition.kind, "plane or radial", "pick one of them")
 
 
@@ -149,7 +152,7 @@ def surface_slope(pos: np.ndarray, scene: Scene) -> float:
     """Slope of a drum's free surface in one frame (n, 3): height over the way across the axis, signed; as
     `angle_of_repose` reads it. nan where the surface's grains span less than two cells."""
     (axis, across, up), radius = drum_axes(scene), scene.grains.radii_m[-1]
-    bed = _bed(pos, radius)
+    bed = _bed(pos, DRUM_GAP_DIAMETERS * 2 * radius)
     if len(bed) == 0:
         return float("nan")
     slab = bed[mid_length(bed, axis)]
@@ -167,11 +170,11 @@ def mid_length(pos: np.ndarray, axis: np.ndarray) -> np.ndarray:
     return (along >= low) & (along <= high)
 
 
-def _bed(pos: np.ndarray, radius: float) -> np.ndarray:
-    """Grains (n, 3) of the largest cluster of one frame (n_grains, 3)."""
+def _bed(pos: np.ndarray, gap_m: float) -> np.ndarray:
+    """Grains (n, 3) of the largest cluster of one frame (n_grains, 3): each is nearer than `gap_m` to another."""
     if len(pos) == 0:
         return pos
-    pairs = cKDTree(pos).query_pairs(BED_GAP_DIAMETERS * 2 * radius, output_type="ndarray")
+    pairs = cKDTree(pos).query_pairs(gap_m, output_type="ndarray")
     links = coo_matrix((np.ones(len(pairs), np.int8), (pairs[:, 0], pairs[:, 1])), shape=(len(pos), len(pos)))
     label = connected_components(links, directed=False)[1]
     return pos[label == np.bincount(label).argmax()]

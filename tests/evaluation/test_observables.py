@@ -57,6 +57,15 @@ def test_a_crater_has_a_negative_radial_angle(tmp_path):
     assert angle_of_repose(pos, scene)[0] == pytest.approx(-20.0, abs=0.5)
 
 
+def test_a_jet_that_falls_onto_a_heap_is_no_part_of_its_surface(tmp_path):
+    scene = scenes.heap_case(tmp_path / "heap.h5", "radial", angle_deg=25.0)
+    heap = Trajectory(tmp_path / "heap.h5").read("position")[:1]
+    beside, up = np.meshgrid([-1.1, 0.0, 1.1], np.arange(1, 11) * 1.1)
+    jet = 2 * scenes.RADIUS_M * np.stack([beside.ravel(), 0 * beside.ravel(), up.ravel()], axis=1)
+    both = np.concatenate([heap, jet[None]], axis=1)
+    np.testing.assert_allclose(angle_of_repose(both, scene), angle_of_repose(heap, scene), atol=1e-9)
+
+
 def test_angle_of_repose_of_too_few_grains_is_nan(tmp_path):
     scene = scenes.heap_case(tmp_path / "heap.h5", "plane", angle_deg=25.0)
     assert np.isnan(angle_of_repose(np.zeros((1, 2, 3)), scene)[0])
