@@ -20,6 +20,7 @@ from gns_pyg.dynamics.model_config import ModelConfig
 from gns_pyg.dynamics.simulator import Simulator
 from gns_pyg.errors import BundleError
 from gns_pyg.files import whole
+from gns_pyg.models.impulse_network import Damping
 from gns_pyg.models.statistics import Statistics
 from gns_pyg.scene.boundary_points import BoundaryPoints, boundary_points
 from gns_pyg.scene.requirements import Requirements, transferred
@@ -140,7 +141,7 @@ def load(folder: str | Path, scene: Scene | None = None) -> Simulator:
     model = typed(ModelConfig, description.get("model"), "model")
     path = folder / "weights.safetensors"
     try:
-        weights = load_file(path)
+        weights = _damping_felt(load_file(path))
         _check_weights(path, weights, model)
         if scene is None:
             points = {name: _points(path, weights, part) for part, name in enumerate(own.boundary)}
@@ -158,6 +159,15 @@ def load(folder: str | Path, scene: Scene | None = None) -> Simulator:
     except (OSError, SafetensorError, KeyError, RuntimeError) as error:
         raise BundleError(path, str(error), "the weights of the model in bundle.json", REMEDY) from None
     return simulator.eval()
+
+
+def _damping_felt(weights: dict[str, Tensor]) -> dict[str, Tensor]:
+    """`weights`; where they are of before 29 November 2026, their damping with the factor `Damping.FELT`, 0."""
+    for name in ("damping.shares.2.weight", "damping.shares.2.bias"):
+        if name in weights and len(weights[name]) == Damping.FELT.start:
+            lacking = weights[name].new_zeros(Damping.FELT.stop - Damping.FELT.start, *weights[name].shape[1:])
+            weights[name] = torch.cat([weights[name], lacking])
+    return weights
 
 
 def _check_weights(path: Path, weights: Mapping[str, Tensor], model: ModelConfig) -> None:

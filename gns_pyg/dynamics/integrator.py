@@ -56,13 +56,16 @@ class Integrator:
         if not self.free_flight:
             still = torch.zeros_like(state.vel)
             return replace(state, vel=still, ang_vel=None if state.ang_vel is None else still, time_s=later)
-        damping = None
-        if state.parameters is not None:
-            damping = state.parameters[state.batch, PARAMETERS.index("damping")]
-        pos, vel = free_flight(state.pos, state.vel, self.scene, self.dt_s, damping)
+        pos, vel = free_flight(state.pos, state.vel, self.scene, self.dt_s, self.damping(state))
         if self.state == "differences":  # the mean velocity of one frame passes into that of the next
             pos = state.pos + vel * self.dt_s
         return replace(state, pos=pos, vel=vel, time_s=later)
+
+    def damping(self, state: State) -> Float[Tensor, " n_grains"]:
+        """Of each grain: its case's own where cases vary, else the scene's."""
+        if state.parameters is not None:
+            return state.parameters[state.batch, PARAMETERS.index("damping")]
+        return torch.full_like(state.pos[:, 0], self.scene.damping)
 
     def integrate(self, state: State, correction: Float[Tensor, "n_grains d"]) -> State:
         """The next state, one frame later (the paper's equation (11) for `differences`)."""

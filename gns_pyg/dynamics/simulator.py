@@ -27,6 +27,7 @@ from gns_pyg.models.impulse_network import GAINED, MEAN, VELOCITY, Damping, Grai
 from gns_pyg.models.mlp import mlp
 from gns_pyg.models.statistics import Statistics
 from gns_pyg.scene.boundary_points import BoundaryPoints
+from gns_pyg.scene.free_flight import cundall
 from gns_pyg.scene.requirements import Requirements
 from gns_pyg.scene.scene import PARAMETERS, Scene
 from gns_pyg.state import Graph, State, Walls, constant, reached
@@ -226,20 +227,24 @@ class Simulator(nn.Module):
         free_vel: Float[Tensor, "n_grains 3"],
         graph: Graph,
         groups: list[Float[Tensor, "n_grains 3"]],
-        shares: Float[Tensor, "n_grains 5"],
+        shares: Float[Tensor, "n_grains 8"],
     ) -> list[Float[Tensor, "n_grains 3"]]:
         """What damping leaves of what contacts have changed, of grains that something reaches: back comes what damping
-        takes from gravity in free flight, as far as others bear a grain; a share of its motion goes."""
+        takes from gravity in free flight, as far as others bear a grain; a share of its motion goes; and what they
+        give is damped too."""
         free, velocity_m_s = self.integrator.without_contact(state), self.statistics.velocity_m_s
         spin = torch.zeros_like(free_vel) if state.ang_vel is None else state.radius[:, None] * state.ang_vel
         without = [(state.vel + free_vel) / 2, free_vel, spin]  # undamped
         taken = [without[0] - (free.pos - state.pos) / self.scene.frame_dt_s, without[1] - free.vel]
-        without, taken = ([(x / velocity_m_s).to(shares.dtype) for x in xs] for xs in (without, taken))
+        start, damping = [state.vel, state.vel, spin], self.integrator.damping(state)[:, None].to(shares.dtype)
+        start, without, taken = ([(x / velocity_m_s).to(shares.dtype) for x in xs] for xs in (start, without, taken))
         touched = reached(len(state.pos), *graph.grain_edges, graph.wall_edges[1])
-        borne, slowed = shares[:, Damping.BORNE], shares[:, Damping.SLOWED]
+        borne, slowed, felt = (shares[:, part] for part in (Damping.BORNE, Damping.SLOWED, Damping.FELT))
         found = []
-        for k, (given, own) in enumerate(zip(groups, without, strict=True)):
-            left = given - slowed[:, k, None] * (own + given)
+        for k, (given, own, vel) in enumerate(zip(groups, without, start, strict=True)):
+            drive = own - vel if self.scene.damping_on_gravity else torch.zeros_like(vel)
+            added = cundall(vel, drive + given, damping) - cundall(vel, drive, damping)
+            left = given - slowed[:, k, None] * (own + given) + felt[:, k, None] * added
             found.append(left + borne[:, k, None] * taken[k] if k < len(taken) else left)
         return [torch.where(touched[:, None], left, 0.0) for left in found]
 

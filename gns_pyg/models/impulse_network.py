@@ -7,6 +7,7 @@ third law), a tangential impulse turns both grains as an impulse at the point of
 mirrored comes out turned or mirrored (vectors enter only as products with each other, as in Schuett et al. 2021).
 """
 
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 
@@ -187,27 +188,31 @@ class ImpulseRound(MessagePassing):
 
 class Damping(nn.Module):
     """What a DEM's damping leaves of that. Cundall's takes from every force that speeds a grain up and adds to those
-    that slow it down, which no two grains give each other. How much in a frame is learned, as shares of what is known.
+    that slow it down, along x, y and z one by one, which no two grains give each other. How much in a frame is learned,
+    as shares of what is known: forces come and go within a frame.
 
     Args:
         hidden, channels: see `ImpulseNetwork`.
     """
 
     BORNE, SLOWED = slice(0, 2), slice(2, 5)  # shares of: gravity's damping given back; mean, end velocity, spin lost
+    FELT = slice(5, 8)  # times what Cundall's law adds if what contacts give is one steady force: mean, end, spin
 
     def __init__(self, hidden: int, channels: int) -> None:
         super().__init__()
-        self.shares = mlp(hidden + 6 * channels, hidden, 5, 2)
-        with torch.no_grad():  # begin with little
+        self.shares = mlp(hidden + 6 * channels, hidden, 8, 2)
+        with torch.no_grad():  # begin with a steady force's, and little else
             final = list(self.shares[-1].parameters())[-1]
-            final.fill_(-3.0)
+            final[: self.FELT.start].fill_(-3.0)
+            final[self.FELT].fill_(math.atanh(0.5))
 
-    def forward(self, before: Grains, after: Grains, slow: float) -> Float[Tensor, "n 5"]:
-        """Shares between 0 and 1."""
+    def forward(self, before: Grains, after: Grains, slow: float) -> Float[Tensor, "n 8"]:
+        """Shares between 0 and 1, and times between -2 and 2."""
         lengths = []
         for old, new in ((before.vel, after.vel), (before.spin, after.spin)):
             lengths += [(x.square().sum(1) + SOFT * slow).sqrt() for x in (old, new, new - old)]
-        return self.shares(torch.cat([after.latent, fine(torch.cat(lengths, dim=1), slow)], dim=1)).sigmoid()
+        shares = self.shares(torch.cat([after.latent, fine(torch.cat(lengths, dim=1), slow)], dim=1))
+        return torch.cat([shares[:, : self.FELT.start].sigmoid(), 2 * shares[:, self.FELT].tanh()], dim=1)
 
 
 def pieces(contacts: Contacts, hidden: int, n: int, *, mutual: bool) -> list[Piece]:

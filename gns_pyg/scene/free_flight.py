@@ -1,4 +1,4 @@
-"""The law a grain follows when it touches nothing: gravity with the DEM's own damping."""
+"""The law a grain follows when it touches nothing, gravity with the DEM's own damping, and that damping alone."""
 
 import torch
 from jaxtyping import Float
@@ -42,3 +42,19 @@ def free_flight(
     turn_pos = pos + (vel + turn_vel) / 2 * until_turn
     end_vel = turn_vel + speeding * rest
     return turn_pos + (turn_vel + end_vel) / 2 * rest, end_vel
+
+
+def cundall(
+    vel: Float[Tensor, "n 3"], gained: Float[Tensor, "n 3"], damping: Float[Tensor, "n 1"]
+) -> Float[Tensor, "n 3"]:
+    """What Cundall's damping adds to velocities that one steady force takes from `vel` to `vel` + `gained`: a component
+    gains less where the force speeds it up, and loses more where the force slows it down (see `free_flight`).
+
+    Args:
+        vel: any unit.
+        gained: without damping, in that unit.
+        damping: of each grain.
+    """
+    against = vel * gained < 0
+    slowing = torch.where(against, -vel / torch.where(against, (1 + damping) * gained, 1.0), 0.0).clamp(max=1.0)
+    return damping * gained * (2 * slowing - 1)  # of the time, the part before the turning point slows

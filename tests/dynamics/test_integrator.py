@@ -2,6 +2,7 @@
 
 from dataclasses import replace
 
+import numpy as np
 import pytest
 import torch
 from hypothesis import given
@@ -9,7 +10,7 @@ from hypothesis import strategies as st
 
 from gns_pyg.dynamics.integrator import STATES, Integrator
 from gns_pyg.errors import ConfigError
-from gns_pyg.scene.free_flight import free_flight
+from gns_pyg.scene.free_flight import cundall, free_flight
 from tests import scenes
 from tests.simulators import state_in_box
 
@@ -66,3 +67,22 @@ def test_damping_that_spares_gravity_leaves_plain_ballistics():
 def test_unknown_state_is_refused():
     with pytest.raises(ConfigError, match="differences or velocity or full"):
         Integrator(scenes.scene(1, 5), "momentum", free_flight=True)
+
+
+@given(vel=st.floats(-3, 3), gained=st.floats(-3, 3), damping=st.floats(0, 0.9))
+def test_damping_of_a_steady_force_is_the_dem_s_law_in_small_steps(vel, gained, damping):
+    """Yade's law for a component of the force: less by a share where it speeds up, more where it slows down."""
+    now, steps = vel, 4000
+    for _ in range(steps):
+        now += gained / steps * (1 - damping * np.sign(gained * (now + gained / steps / 2)))
+    v, g = (torch.full((1, 3), x, dtype=torch.float64) for x in (vel, gained))
+    damped = v + g + cundall(v, g, torch.full((1, 1), damping, dtype=torch.float64))
+    np.testing.assert_allclose(damped, now, atol=2e-3)
+
+
+def test_damping_of_gravity_is_that_of_free_flight():
+    scene, state = scenes.scene(40, 5, damping=0.2), state_in_box([40])
+    gained = torch.tensor([[0.0, 0.0, -9.81]]).double().expand(40, 3) * 0.01
+    end = free_flight(state.pos, state.vel, scene, 0.01)[1]
+    damped = state.vel + gained + cundall(state.vel, gained, torch.full((40, 1), 0.2).double())
+    assert torch.allclose(end, damped, atol=1e-14)

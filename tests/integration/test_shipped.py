@@ -10,6 +10,7 @@ from gns_pyg.data.datamodule import EMBEDDED
 from gns_pyg.data.trajectory import Trajectory
 from gns_pyg.errors import BundleError, ConfigError
 from gns_pyg.evaluation.errors import position_error, positions
+from gns_pyg.models.impulse_network import Damping
 from tests.integration.runs import config
 
 SHIPPED = sorted(path.name for path in bundle.SHIPPED.iterdir())
@@ -30,6 +31,12 @@ def test_a_shipped_bundle_rolls_out_from_an_unseen_case_and_stays_near_it(name, 
         json.loads((tmp_path / "metrics.json").read_text())["test/one_step_error_m"] == metrics["test/one_step_error_m"]
     )
     assert f"{dem.path.stem} (unseen)" in (tmp_path / "report.html").read_text()
+
+
+def test_a_bundle_of_before_contacts_were_damped_along_axes_damps_none():
+    last = bundle.load("hopper").damping.shares[-1]
+    assert not last.weight[Damping.FELT].any()
+    assert not last.bias[Damping.FELT].any()
 
 
 def test_an_ensemble_says_mean_spread_and_score(tmp_path):

@@ -7,6 +7,7 @@ import torch
 from scipy.spatial.transform import Rotation
 
 from gns_pyg.errors import ConfigError
+from gns_pyg.scene.free_flight import cundall
 from gns_pyg.state import Walls
 from tests import scenes
 from tests.simulators import IMPULSE, simulator, state_in_box
@@ -46,8 +47,10 @@ def test_unlike_masses_keep_their_momentum():
 @pytest.mark.parametrize("mirrored", [False, True])
 @pytest.mark.parametrize("damping", [0.0, 0.2])
 def test_what_is_turned_or_mirrored_comes_out_turned_or_mirrored(walls, mirrored, damping):
+    """Where damping acts, along x, y and z one by one, only turns from axis to axis leave the law as it is."""
     network, start = model(walls, gravity=0.0, damping=damping), state_in_box([40])
-    q = torch.from_numpy(Rotation.from_euler("xyz", [0.3, 1.1, -2.0]).as_matrix())
+    turns = [90, 180, -90] if damping else [17, 63, -115]
+    q = torch.from_numpy(Rotation.from_euler("xyz", turns, degrees=True).as_matrix().round(0 if damping else 15))
     q, hand = (-q, -1.0) if mirrored else (q, 1.0)
     graph = network.graph(start)
     turned = replace(start, pos=start.pos @ q.T, vel=start.vel @ q.T, ang_vel=hand * start.ang_vel @ q.T)
@@ -136,17 +139,24 @@ def test_rounds_see_what_earlier_rounds_have_changed():
         assert bool(moved) == reached
 
 
-def with_shares(network, share):
-    network.damping.forward = lambda before, after, slow: torch.full((len(after.latent), 5), share).double()
+def with_shares(network, share, felt=0.0):
+    shares = torch.tensor([share] * 5 + [felt] * 3).double()
+    network.damping.forward = lambda before, after, slow: shares.expand(len(after.latent), 8)
     return network
+
+
+def damped_and_plain(state):
+    """The same networks with and without damping to learn."""
+    damped, plain = (model(walls=True, damping=0.2, state=state, **row) for row in ({}, {"damped": False}))
+    plain.load_state_dict({name: w for name, w in damped.state_dict().items() if not name.startswith("damping")})
+    return damped, plain
 
 
 @pytest.mark.parametrize("state", STATES)
 def test_damping_takes_nothing_or_all(state):
     """Shares of 1: no grain that something reaches moves any more; of 0: as if there were no damping to learn."""
     start = state_in_box([40], spin=state == "full")
-    damped, plain = (model(walls=True, damping=0.2, state=state, **row) for row in ({}, {"damped": False}))
-    plain.load_state_dict({name: w for name, w in damped.state_dict().items() if not name.startswith("damping")})
+    damped, plain = damped_and_plain(state)
     assert torch.allclose(with_shares(damped, 0.0).correction(start), plain.correction(start), atol=1e-14)
     graph = damped.graph(start)
     reached = torch.cat([*graph.grain_edges, graph.wall_edges[1]]).unique()
@@ -154,3 +164,18 @@ def test_damping_takes_nothing_or_all(state):
     assert torch.allclose(after.pos[reached], start.pos[reached], atol=1e-12)
     assert after.vel[reached].abs().max() < 1e-12
     assert after.ang_vel is None or after.ang_vel[reached].abs().max() < 1e-10
+
+
+def test_what_contacts_give_is_damped_along_x_y_and_z():
+    """As one steady force beside gravity (`cundall`), where the learned factor is 1."""
+    start, (damped, plain) = state_in_box([40]), damped_and_plain("full")
+    ends = [
+        m.integrator.integrate(start, m.correction(start) * m.scale).vel for m in (with_shares(damped, 0, 1), plain)
+    ]
+    gravity, damping = torch.tensor([0, 0, -9.81]).double() * plain.scene.frame_dt_s, torch.full((40, 1), 0.2).double()
+    given = ends[1] - plain.integrator.without_contact(start).vel
+    touched = (given.abs().sum(1) > 0)[:, None]
+    expected = start.vel + gravity + given + cundall(start.vel, gravity + given, damping)
+    assert touched.any()
+    assert not torch.allclose(*ends)
+    assert torch.allclose(torch.where(touched, ends[0], 0.0), torch.where(touched, expected, 0.0), atol=1e-12)
