@@ -5,6 +5,7 @@ directions, and the next round sees what all impulses together have changed: an 
 whose law is learned. Three things hold by construction, not by training: the pair's momentum does not change (Newton's
 third law), a tangential impulse turns both grains as an impulse at the point of contact does, and what is turned or
 mirrored comes out turned or mirrored (vectors enter only as products with each other, as in Schuett et al. 2021).
+What a DEM's damping does to that acts along x, y and z: turned from axis to axis only (`Damping`).
 """
 
 import math
