@@ -26,7 +26,7 @@ from gns_pyg.evaluation.judge import judge
 from gns_pyg.evaluation.metrics import Evaluation, observe, strict, write_json
 from gns_pyg.evaluation.observables import angle_of_repose, escaped_grains, from_frame, mean_speed, time_mean
 from gns_pyg.evaluation.predict import roll_out, start_frame
-from gns_pyg.report.plots import draw, ensemble_spread
+from gns_pyg.report.plots import draw, ensemble_spread, write_picture
 from gns_pyg.report.results_page import results_page
 from gns_pyg.scene.scene import Scene
 
@@ -97,7 +97,7 @@ def ensemble_of(name: str, simulator: Simulator, case: Trajectory, folder: Path)
     """What an ensemble says of a case, without the curves of its observables; draws them."""
     ensemble = roll_out_ensemble(simulator, case, start_frame(case, START_S), MEMBERS)
     title = f"{simulator.scene.name}, {case.path.stem}: {MEMBERS} roll-outs a micrometre apart"
-    ensemble_spread(ensemble, title).savefig(folder / f"results_{name}_ensemble.png", dpi=110)
+    write_picture(ensemble_spread(ensemble, title), folder / f"results_{name}_ensemble.png", dpi=110)
     return {key: value for key, value in ensemble.plain().items() if key != "observables"}
 
 
@@ -203,10 +203,9 @@ def seed_scatter(cases: Sequence[Trajectory], scene: Scene) -> dict[str, float]:
 
 def pictures(evaluation: Evaluation, scene: Scene, folder: Path, name: str) -> None:
     """Writes the figures that the page shows as results_<name>_<figure>.png."""
-    folder.mkdir(parents=True, exist_ok=True)
     for figure_name, figure in draw(evaluation, scene).items():
         if figure_name in PICTURES:
-            figure.savefig(folder / f"results_{name}_{figure_name}.png", dpi=90)
+            write_picture(figure, folder / f"results_{name}_{figure_name}.png", dpi=90)
 
 
 if __name__ == "__main__":

@@ -2,6 +2,7 @@
 DEM, network and climatology also differ by line style, so that a print in black and white reads too."""
 
 from collections.abc import Callable, Sequence
+from io import BytesIO
 from pathlib import Path
 from typing import Literal
 
@@ -13,6 +14,7 @@ from matplotlib.collections import EllipseCollection, LineCollection
 from matplotlib.colors import Normalize
 from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
+from PIL import Image
 from trimesh import Trimesh
 
 from gns_pyg.evaluation.ensemble import Ensemble
@@ -49,6 +51,13 @@ def write_figure(figure: Figure, path: Path) -> list[Path]:
         with whole(file) as temporary:
             figure.savefig(temporary, format=file.suffix[1:], dpi=150)
     return files
+
+
+def write_picture(figure: Figure, file: Path, dpi: int) -> None:
+    """Writes a figure for the repository: a PNG of at most 256 colours, a third of the size of one of all colours."""
+    with whole(file) as temporary, BytesIO() as drawn:
+        figure.savefig(drawn, format="png", dpi=dpi)
+        Image.open(drawn).convert("RGB").quantize(dither=Image.Dither.NONE).save(temporary, format="png", optimize=True)
 
 
 def draw(evaluation: Evaluation, scene: Scene) -> dict[str, Figure]:

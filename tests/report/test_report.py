@@ -5,6 +5,7 @@ import re
 
 import numpy as np
 import pytest
+from PIL import Image
 
 from gns_pyg.bundle import SHIPPED
 from gns_pyg.data.trajectory import Trajectory
@@ -14,7 +15,7 @@ from gns_pyg.evaluation.errors import positions
 from gns_pyg.evaluation.metrics import case_result, evaluate_cases, write_json
 from gns_pyg.evaluation.stress import Line
 from gns_pyg.report.page import Model, read_stability, write_page
-from gns_pyg.report.plots import draw, write_plots
+from gns_pyg.report.plots import draw, write_picture, write_plots
 from gns_pyg.report.sections import scene_summary
 from gns_pyg.report.table import metric_rows, text_table
 from gns_pyg.report.verdict import Verdict
@@ -49,6 +50,16 @@ def test_every_figure_is_written_as_png_and_svg(figures):
     assert {file.stem for file in figures} == names
     for file in figures:
         assert file.read_bytes().startswith(b"\x89PNG" if file.suffix == ".png" else b"<?xml"), file
+
+
+def test_a_picture_for_the_repository_looks_the_same_in_half_the_bytes(heap, tmp_path):
+    figure = draw(heap[1], heap[0])["snapshots"]
+    figure.savefig(tmp_path / "all.png", dpi=90)
+    write_picture(figure, tmp_path / "new" / "few.png", dpi=90)
+    every, few = (Image.open(tmp_path / name).convert("RGB") for name in ("all.png", "new/few.png"))
+    assert few.size == every.size
+    assert np.abs(np.asarray(few, float) - np.asarray(every, float)).mean() < 2.0  # of 255
+    assert (tmp_path / "new" / "few.png").stat().st_size < (tmp_path / "all.png").stat().st_size / 2
 
 
 def test_a_turning_scene_without_angle_of_repose(tmp_path):
