@@ -128,7 +128,7 @@ def trained(cfg: DictConfig) -> tuple[Simulator, Split, Climatology, dict[str, A
     identity |= {f"scene.boundary.{name}.points": part.points for name, part in scene.boundary.items()}
     identity["scene.seed"] = scene.seed  # of the boundary points
     del identity["training.updates"]  # a run may be lengthened
-    begun = {key: value.clone() for key, value in simulator.state_dict().items()}
+    begun = {key: value.clone() for key, value in simulator.state_dict().items() if training.start_share}
     module = TrainingModule(simulator, training, identity)
     resume_from = cfg.ckpt_path
     if resume_from is None and (last := folder / "checkpoints" / "last.ckpt").is_file():
