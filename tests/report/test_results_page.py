@@ -58,3 +58,19 @@ def test_angles_of_long_runs_are_held_against_one_degree_from_three_cases_on(off
     page = results_page({"drum": STORED["drum"] | {"long": {"cases": cases}}})
     assert ("Angle of repose in long runs" in page) == (said is not None)
     assert said is None or said in page
+
+
+@pytest.mark.parametrize(
+    ("off", "said"), [([0.1, -0.1, 0.0, 0.2], "+0.1 ± 0.2"), ([1.5, -0.5, 1.4, -0.4], "+0.5 ± 1.7")]
+)
+def test_the_angle_of_three_cases_or_more_is_as_well_known_as_they_agree(off, said):
+    scene = STORED["hopper"]
+    cases = [
+        case | {"test/angle_of_repose_deg": case["test/angle_of_repose_dem_deg"] + by}
+        for case, by in zip(scene["cases"], off, strict=True)
+    ]
+    line = next(
+        row for row in results_page({"hopper": scene | {"cases": cases}}).splitlines() if row.startswith("| angle")
+    )
+    assert f"{said} off (4 cases)" in line
+    assert line.endswith("**no** |") == (said == "+0.5 ± 1.7")
