@@ -162,7 +162,7 @@ def _rows(
         off, error, over = _off([(case[angle], case[dem]) for case in cases]) or (
             m[angle] - m[dem],
             Z_95 * in_time,
-            "in time: too few cases",
+            "95 % in time: too few cases",
         )
         rows.append(
             row(
@@ -207,7 +207,7 @@ def _equivalence(cases: Sequence[Mapping[str, Any]]) -> list[str]:
     mean, within, over = found
     holds = abs(mean) + within <= 1.0
     return [
-        f"\nAngle of repose in long runs: {mean:+.2f} ± {within:.2f} degrees off (95 %, {over}); within 1 "
+        f"\nAngle of repose in long runs: {mean:+.2f} ± {within:.2f} degrees off ({over}); within 1 "
         f"degree: {'yes' if holds else '**no**'}."
     ]
 
@@ -219,7 +219,7 @@ def _off(angles: Sequence[tuple[float | None, float]]) -> tuple[float, float, st
     if len(off) < 3:
         return None
     error = statistics.stdev(off) / math.sqrt(len(off)) * float(t.ppf(0.975, len(off) - 1))
-    return statistics.mean(off), error, f"{len(off)} cases"
+    return statistics.mean(off), error, f"95 %, {len(off)} cases"
 
 
 def _condition(condition: str, m: Mapping[str, Any]) -> str:

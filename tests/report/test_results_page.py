@@ -72,5 +72,5 @@ def test_the_angle_of_three_cases_or_more_is_as_well_known_as_they_agree(off, sa
     line = next(
         row for row in results_page({"hopper": scene | {"cases": cases}}).splitlines() if row.startswith("| angle")
     )
-    assert f"{said} off (4 cases)" in line
+    assert f"{said} off (95 %, 4 cases)" in line
     assert line.endswith("**no** |") == (said == "+0.5 ± 1.7")
