@@ -28,8 +28,9 @@ class TrainingConfig:
             does not grow with the scene; null looks at all.
         loss_knee: where the loss turns from the square of a scaled error (of mean velocity, end velocity, spin) to its
             length; 0 is the mean square throughout (the paper).
-        balance: weight of the momentum and the energy that cells of some 30 grains wrongly gain or lose together. (Each
-            grain's own error is smallest for an average motion, which loses speed at every step.) 0 leaves it out.
+        balance: weight of the momentum and the energy that cells of some 30 and 300 grains wrongly gain or lose
+            together. (Each grain's own error is smallest for an average motion, which loses speed at every step.) 0
+            leaves it out.
         start_from: a bundle whose weights and scales training starts from; null draws and measures them. Parameters
             that vary here, where none did there, become inputs (impulse networks).
         start_share: what is judged and saved is this share of the weights of `start_from` and the rest of the trained

@@ -3,7 +3,8 @@
 Of the motions that can follow a state, a network trained on each grain's error learns an average, and an average moves
 less than what it is an average of: |E v|^2 <= E |v|^2 (Jensen). A step by step loss of speed and fluctuation is the
 result, and the better-known part of the error does not show it. So cells of grains, small against the flow and large
-against a collision (coarse graining: Goldhirsch 2010), must also keep, on average, the DEM's momentum and energy.
+against a collision (coarse graining: Goldhirsch 2010), must also keep, on average, the DEM's momentum and energy. So
+must larger ones, whose means scatter less: in small cells an error that a whole bed shares drowns.
 """
 
 from collections.abc import Sequence
@@ -13,7 +14,7 @@ from jaxtyping import Float, Int
 from torch import Tensor
 from torch import distributed as dist
 
-CELL_RADII = 8.0  # edge of a cell: 30 grains of a dense bed
+CELLS = ((8.0, 1.0), (17.6, 10.0))  # edge in radii, weight: 30 and 300 grains of a dense bed; scatter weighs alike
 
 
 def mean_loss(error: Float[Tensor, "n d"], knee: float) -> Float[Tensor, ""]:

@@ -18,7 +18,7 @@ from gns_pyg.state import State, Window
 from gns_pyg.training.augment import transform
 from gns_pyg.training.checkpoint import REMEDY
 from gns_pyg.training.config import TrainingConfig
-from gns_pyg.training.loss import CELL_RADII, balance_loss, cells, mean_loss, share_of_mean
+from gns_pyg.training.loss import CELLS, balance_loss, cells, mean_loss, share_of_mean
 from gns_pyg.training.noise import perturb
 
 MOST = 1e15  # of any number in a checkpoint beside its tensors
@@ -163,12 +163,16 @@ class TrainingModule(pl.LightningModule):
     def _imbalance(
         self, error: Tensor, state: State, following: State, counted: Tensor, randoms: Sequence[torch.Generator]
     ) -> Tensor:
-        """`balance_loss` of the `counted` grains, velocities over the data's scale."""
+        """`balance_loss` of the `counted` grains in cells of every size, velocities over the data's scale."""
         simulator, (pos, batch, vel) = self.simulator, (x[counted] for x in (state.pos, state.batch, following.vel))
-        velocity_m_s, size_m = simulator.statistics.velocity_m_s, CELL_RADII * max(simulator.scene.grains.radii_m)
+        velocity_m_s, radius_m = simulator.statistics.velocity_m_s, max(simulator.scene.grains.radii_m)
         end = slice(3, 6) if simulator.integrator.n_groups > 1 else slice(3)  # with differences mean and end are one
         error = error[:, end] * simulator.scale[end] / velocity_m_s
-        return balance_loss(error, (vel / velocity_m_s).to(error.dtype), cells(pos, batch, size_m, randoms))
+        vel = (vel / velocity_m_s).to(error.dtype)
+        terms = [
+            weight * balance_loss(error, vel, cells(pos, batch, edge * radius_m, randoms)) for edge, weight in CELLS
+        ]
+        return torch.stack(terms).sum()
 
     def _random(self, *window: int) -> torch.Generator:
         """A generator for this update, or for one window of its batch, whichever process computes it."""

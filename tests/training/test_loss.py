@@ -33,6 +33,14 @@ def test_balance_is_the_square_of_what_a_cell_gains_together():
     assert balance_loss(error[:0], vel[:0], cell[:0]).item() == 0
 
 
+def test_ten_times_larger_cells_scatter_a_tenth_and_see_all_of_an_error_that_grains_share():
+    scatter = 1e-3 * torch.randn(30_000, 3, generator=torch.Generator().manual_seed(0), dtype=torch.float64)
+    shared = torch.tensor([0.0, 0.0, 1e-4], dtype=torch.float64).expand_as(scatter)
+    still, (small, large) = torch.zeros_like(scatter), (torch.arange(30_000) // grains for grains in (30, 300))
+    assert balance_loss(shared, still, large) / balance_loss(shared, still, small) == pytest.approx(1)
+    assert balance_loss(scatter, still, large) / balance_loss(scatter, still, small) == pytest.approx(0.1, rel=0.3)
+
+
 @pytest.mark.parametrize("weight", [0.0, 1e4])
 def test_an_average_motion_loses_energy_unless_cells_must_keep_it(weight):
     """Half of the grains move at 2, half at 0, each along its own direction, and who does cannot be known."""

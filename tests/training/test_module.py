@@ -8,6 +8,7 @@ import torch
 from gns_pyg.data.trajectory import Trajectory
 from gns_pyg.data.windows import Windows
 from gns_pyg.state import Window
+from gns_pyg.training import module as training_module
 from gns_pyg.training.config import TrainingConfig
 from gns_pyg.training.module import TrainingModule
 from gns_pyg.training.noise import perturb
@@ -110,6 +111,25 @@ def test_free_flight_leaves_nothing_to_learn(state, own_steps, balance, tmp_path
     windows = Windows([Trajectory(tmp_path / "case.h5")], training.config.window_length)
     batch = Window.collate([windows[0], windows[len(windows) - 1]])
     assert training.training_step(batch, 0).item() < 1e-8  # 0.1 um and 10 um/s of rounding in the file; a frame is 1
+
+
+def test_balance_adds_up_cells_of_every_size_each_with_its_weight(tmp_path, monkeypatch):
+    scene = scenes.free_flight_case(tmp_path / "case.h5", n_frames=9)
+    window = Windows([Trajectory(tmp_path / "case.h5")], 3)[0]
+
+    def loss(*sizes, balance=2.0):
+        monkeypatch.setattr(training_module, "CELLS", sizes)
+        config = TrainingConfig(**CONFIG | {"balance": balance})
+        training = TrainingModule(simulator(scene, dtype=torch.float64), config)
+        monkeypatch.setattr(training, "log", lambda *_, **__: None)
+        return training.training_step(window, 0).item()
+
+    alone, large, small = loss(balance=0.0), (1e9, 3.0), (1e-6, 1.0)  # all grains in one cell; each in its own
+    found = loss(large) - alone, loss(small) - alone
+    assert min(found) > 0
+    assert found[0] != pytest.approx(found[1])
+    assert loss(small, large) - alone == pytest.approx(sum(found))
+    assert loss((1e9, 6.0)) - alone == pytest.approx(2 * found[0])
 
 
 def test_noise_is_seen_in_the_loss(tmp_path, monkeypatch):
