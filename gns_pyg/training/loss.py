@@ -3,8 +3,8 @@
 Of the motions that can follow a state, a network trained on each grain's error learns an average, and an average moves
 less than what it is an average of: |E v|^2 <= E |v|^2 (Jensen). A step by step loss of speed and fluctuation is the
 result, and the better-known part of the error does not show it. So cells of grains, small against the flow and large
-against a collision (coarse graining: Goldhirsch 2010), must also keep, on average, the DEM's momentum and energy. So
-must larger ones, whose means scatter less: in small cells an error that a whole bed shares drowns.
+against a collision (coarse graining: Goldhirsch 2010), must also keep, on average, the DEM's momentum and energy;
+larger ones too, whose means scatter less: in small cells an error that a whole bed shares drowns.
 """
 
 from collections.abc import Sequence
