@@ -16,6 +16,7 @@ from omegaconf.errors import OmegaConfBaseException
 from gns_pyg.config import CONF
 from gns_pyg.errors import GnsError, StorageError
 from gns_pyg.files import REMEDY, held
+from gns_pyg.machine import keep_memory
 
 RANKS = ("RANK", "LOCAL_RANK", "SLURM_PROCID")  # as torchrun, Lightning and srun number their processes
 
@@ -37,6 +38,7 @@ def launch(config_name: str, function: Callable[[DictConfig], Any], configs: str
         with held(Path(cfg.folder)):
             return function(cfg)
 
+    keep_memory()
     os.environ["HYDRA_FULL_ERROR"] = "1"  # Hydra hands errors on; else it prints a traceback for each
     try:
         hydra.main(config_path=configs, config_name=config_name, version_base="1.3")(job)()

@@ -149,8 +149,8 @@ def _condition(name: str, frame_dt_s: float) -> tuple[Scene, list[Trajectory]]:
 
 
 def long_runs(name: str, scene: Scene) -> dict[str, Any]:
-    """Roll-outs several times (hopper: ten or more; drums: three to five) as long as those trained on, beside DEM runs
-    of the same length.
+    """Roll-outs several times (at least one: ten times; reduced drums: five) as long as those trained on, beside DEM
+    runs of the same length.
 
     Returns:
         `cases`: per case `duration_s`; `angle_of_repose_deg`, mean over the steady part, and its

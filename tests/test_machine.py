@@ -1,0 +1,34 @@
+"""The machine: memory that is kept."""
+
+import platform
+import subprocess
+import sys
+
+import pytest
+
+from gns_pyg import launch
+
+FAULTS = """
+import resource, torch
+from gns_pyg.machine import keep_memory
+keep_memory()
+for turn in range(16):
+    if turn == 8:
+        before = resource.getrusage(resource.RUSAGE_SELF).ru_minflt
+    [torch.ones(300_000) for _ in range(200)]
+print(resource.getrusage(resource.RUSAGE_SELF).ru_minflt - before)
+"""
+
+
+@pytest.mark.skipif(platform.libc_ver()[0] != "glibc", reason="another C library than glibc: memory is not kept")
+def test_memory_that_is_kept_is_not_mapped_anew():
+    done = subprocess.run([sys.executable, "-c", FAULTS], capture_output=True, text=True, check=True)
+    assert int(done.stdout) < 500  # of 468,800 pages; nearly all of them where memory is not kept
+
+
+def test_every_command_keeps_memory(monkeypatch):
+    kept = []
+    monkeypatch.setattr(launch, "keep_memory", lambda: kept.append(True))
+    monkeypatch.setattr(launch.hydra, "main", lambda **_: lambda _: lambda: None)
+    launch.launch("train", print)
+    assert kept
