@@ -210,4 +210,5 @@ def pictures(evaluation: Evaluation, scene: Scene, folder: Path, name: str) -> N
 
 if __name__ == "__main__":
     logging.basicConfig(level=logging.INFO, format="%(message)s")
+    machine.keep_memory()  # as commands do
     results(DOCS, sys.argv[1:] or REDUCED)
