@@ -31,7 +31,7 @@ def peak_memory_mb() -> float:
 
 def keep_memory() -> None:
     """This process keeps the memory that it frees, in blocks of up to 32 MiB, for its next use, where its C library is
-    glibc; which else hands it back to the system, to be cleared and mapped anew at every step of many grains."""
+    glibc, which else hands it back to the system, to be cleared and mapped anew at every step of many grains."""
     with suppress(OSError, AttributeError):  # another C library
         library = ctypes.CDLL(None)
         library.mallopt(MMAP_THRESHOLD, 32 * 2**20)  # the most that glibc takes
