@@ -109,10 +109,7 @@ class Torch:
 def gns_pyg(graph: dict[str, np.ndarray], *, bfloat16: bool = False) -> Torch:
     import torch
 
-    from gns_pyg.machine import keep_memory
     from gns_pyg.models.contact_network import ContactNetwork
-
-    keep_memory()  # as the program's commands do
 
     class Ours(torch.nn.Module):
         def __init__(self) -> None:

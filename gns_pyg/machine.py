@@ -1,4 +1,4 @@
-"""The machine that figures were measured on. Standard library alone: Yade's Python imports it too."""
+"""The machine that figures were measured on, and its memory. Standard library alone: Yade's Python imports it too."""
 
 import ctypes
 import resource
