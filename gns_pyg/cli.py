@@ -2,11 +2,14 @@
 
 import sys
 
-from gns_pyg import run
 from gns_pyg.config import CONF
 from gns_pyg.launch import launch
-from gns_pyg.tradeoff import app
-from gns_pyg.tradeoff.recommend import recommend
+from gns_pyg.machine import brief_waits
+
+with brief_waits():
+    from gns_pyg import run
+    from gns_pyg.tradeoff import app
+    from gns_pyg.tradeoff.recommend import recommend
 
 
 def train() -> None:

@@ -1,11 +1,17 @@
-"""The machine that figures were measured on, and its memory. Standard library alone: Yade's Python imports it too."""
+"""The machine that figures were measured on, its memory and its threads.
+
+Standard library alone: Yade's Python imports it too.
+"""
 
 import ctypes
+import os
 import resource
-from contextlib import suppress
+from collections.abc import Iterator
+from contextlib import contextmanager, suppress
 from pathlib import Path
 
 TRIM_THRESHOLD, MMAP_THRESHOLD = -1, -3  # glibc's numbers for them, malloc.h
+SPINS = "GOMP_SPINCOUNT"
 
 
 def processor() -> str:
@@ -36,3 +42,18 @@ def keep_memory() -> None:
         library = ctypes.CDLL(None)
         library.mallopt(MMAP_THRESHOLD, 32 * 2**20)  # the most that glibc takes
         library.mallopt(TRIM_THRESHOLD, -1)
+
+
+@contextmanager
+def brief_waits() -> Iterator[None]:
+    """Where torch is loaded within, its threads look 10,000 times (a tenth of a millisecond) whether the others are
+    done before they sleep, not 300,000 times: a thread that has lost its core to another program is waited for at every
+    product. What the user set holds; processes that this one starts are left as they are."""
+    ours = not {SPINS, "OMP_WAIT_POLICY"} & os.environ.keys()
+    if ours:
+        os.environ[SPINS] = "10000"
+    try:
+        yield
+    finally:
+        if ours:
+            del os.environ[SPINS]

@@ -1,5 +1,6 @@
-"""The machine: memory that is kept."""
+"""The machine: memory that is kept, threads that wait briefly."""
 
+import os
 import platform
 import subprocess
 import sys
@@ -32,3 +33,16 @@ def test_every_command_keeps_memory(monkeypatch):
     monkeypatch.setattr(launch.hydra, "main", lambda **_: lambda _: lambda: None)
     launch.launch("train", print)
     assert kept
+
+
+@pytest.mark.skipif(sys.platform != "linux", reason="torch waits otherwise there: the setting is of GNU's OpenMP")
+@pytest.mark.parametrize(
+    ("told", "spins"), [({}, "10000"), ({"GOMP_SPINCOUNT": "70"}, "70"), ({"OMP_WAIT_POLICY": "passive"}, "0")]
+)
+def test_a_command_s_threads_wait_briefly_and_nobody_else_s(told, spins):
+    show = "import os, gns_pyg.cli; print(os.environ.get('GOMP_SPINCOUNT'))"
+    free = {key: value for key, value in os.environ.items() if key not in ("GOMP_SPINCOUNT", "OMP_WAIT_POLICY")}
+    env = free | told | {"OMP_DISPLAY_ENV": "verbose"}
+    done = subprocess.run([sys.executable, "-c", show], env=env, capture_output=True, text=True, check=True)
+    assert f"GOMP_SPINCOUNT = '{spins}'" in done.stderr
+    assert done.stdout.strip() == str(told.get("GOMP_SPINCOUNT"))
