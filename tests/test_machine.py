@@ -29,6 +29,7 @@ def test_memory_that_is_kept_is_not_mapped_anew():
 
 def test_every_command_keeps_memory(monkeypatch):
     kept = []
+    monkeypatch.setenv("HYDRA_FULL_ERROR", "1")  # as `launch` leaves it
     monkeypatch.setattr(launch, "keep_memory", lambda: kept.append(True))
     monkeypatch.setattr(launch.hydra, "main", lambda **_: lambda _: lambda: None)
     launch.launch("train", print)
