@@ -47,7 +47,8 @@ def keep_memory() -> None:
 @contextmanager
 def brief_waits() -> Iterator[None]:
     """Where torch is loaded within, its threads look 10,000 times whether the others are done before they sleep, not
-    300,000 times: a thread that has lost its core to another program is waited for at every product. What the user set holds; processes that this one starts are left as they are."""
+    300,000 times: a thread that has lost its core to another program is waited for at every product. What the user set
+    holds; processes that this one starts are left as they are."""
     ours = not {SPINS, "OMP_WAIT_POLICY"} & os.environ.keys()
     if ours:
         os.environ[SPINS] = "10000"
