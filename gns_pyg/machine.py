@@ -24,6 +24,11 @@ def has_bfloat16() -> bool:
     return bool({"avx512_bf16", "amx_bf16"} & set(_said("flags").split()))
 
 
+def by_intel() -> bool:
+    """Whether Intel made the processor; its own library, MKL, looks for that."""
+    return _said("vendor_id") == "GenuineIntel"
+
+
 def _said(key: str) -> str:
     """What the system says of the first processor, "" where it does not."""
     lines = Path("/proc/cpuinfo").read_text().splitlines() if Path("/proc/cpuinfo").exists() else []

@@ -7,7 +7,7 @@ import sys
 
 import pytest
 
-from gns_pyg import launch
+from gns_pyg import launch, machine
 
 FAULTS = """
 import resource, torch
@@ -47,3 +47,9 @@ def test_a_command_s_threads_wait_briefly_and_nobody_else_s(told, spins):
     done = subprocess.run([sys.executable, "-c", show], env=env, capture_output=True, text=True, check=True)
     assert f"GOMP_SPINCOUNT = '{spins}'" in done.stderr
     assert done.stdout.strip() == str(told.get("GOMP_SPINCOUNT"))
+
+
+@pytest.mark.parametrize(("vendor", "expected"), [("GenuineIntel", True), ("AuthenticAMD", False), ("", False)])
+def test_whose_processor_it_is(monkeypatch, vendor, expected):
+    monkeypatch.setattr(machine, "_said", {"vendor_id": vendor}.get)
+    assert machine.by_intel() is expected

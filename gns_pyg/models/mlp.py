@@ -9,6 +9,8 @@ from typing import Any
 import torch
 from torch import Tensor, nn
 
+from gns_pyg import machine
+
 ROWS = 128  # of which rows come in multiples (see `recurring`)
 BLOCK = 3 * 2**17  # numbers of a latent that each thread of a CPU handles at once: few enough to stay in its cache
 
@@ -17,8 +19,8 @@ FUSED = {torch.float32} if ONE_DNN else set()  # what oneDNN multiplies here
 if ONE_DNN and torch.ops.mkldnn._is_mkldnn_bf16_supported():
     FUSED.add(torch.bfloat16)
 # With gradients, layers from this width on gain more by oneDNN than calling it and laying out what is transposed cost;
-# none where vectors are narrow: MKL is as fast there.
-WIDE = 100 if torch.backends.cpu.get_cpu_capability() == "AVX512" else math.inf
+# none where vectors are narrow, nor on Intel's processors: MKL is as fast there.
+WIDE = 100 if torch.backends.cpu.get_cpu_capability() == "AVX512" and not machine.by_intel() else math.inf
 
 
 Parted = tuple[Callable[[Tensor], Tensor], tuple[Tensor, Tensor] | None]
