@@ -12,7 +12,8 @@ from torch import Tensor, nn
 from gns_pyg import machine
 
 ROWS = 128  # of which rows come in multiples (see `recurring`)
-BLOCK = 3 * 2**17  # numbers of a latent that each thread of a CPU handles at once: few enough to stay in its cache
+# Numbers of a latent that each thread of a CPU handles at once: few enough to stay in its cache.
+BLOCK = 2**20 if machine.by_intel() else 3 * 2**17
 
 ONE_DNN = torch.backends.mkldnn.is_available() and hasattr(torch.ops.mkldnn, "_linear_pointwise")
 FUSED = {torch.float32} if ONE_DNN else set()  # what oneDNN multiplies here
