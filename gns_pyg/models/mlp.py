@@ -11,9 +11,10 @@ from torch import Tensor, nn
 
 from gns_pyg import machine
 
+INTEL = machine.by_intel()
 ROWS = 128  # of which rows come in multiples (see `recurring`)
 # Numbers of a latent that each thread of a CPU handles at once: few enough to stay in its cache.
-BLOCK = 2**20 if machine.by_intel() else 3 * 2**17
+BLOCK = 2**20 if INTEL else 3 * 2**17
 
 ONE_DNN = torch.backends.mkldnn.is_available() and hasattr(torch.ops.mkldnn, "_linear_pointwise")
 FUSED = {torch.float32} if ONE_DNN else set()  # what oneDNN multiplies here
@@ -21,7 +22,7 @@ if ONE_DNN and torch.ops.mkldnn._is_mkldnn_bf16_supported():
     FUSED.add(torch.bfloat16)
 # With gradients, layers from this width on gain more by oneDNN than calling it and laying out what is transposed cost;
 # none where vectors are narrow, nor on Intel's processors: MKL is as fast there.
-WIDE = 100 if torch.backends.cpu.get_cpu_capability() == "AVX512" and not machine.by_intel() else math.inf
+WIDE = 100 if torch.backends.cpu.get_cpu_capability() == "AVX512" and not INTEL else math.inf
 
 
 Parted = tuple[Callable[[Tensor], Tensor], tuple[Tensor, Tensor] | None]
