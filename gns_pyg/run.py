@@ -273,22 +273,13 @@ def build(
         ConfigError: if its model or what it requires differs.
     """
     start = None if training.start_from is None else bundle.load(training.start_from)
-    begun = start is not None or not config.scatter
-    bundled, remedy = "a bundle: scatter is learned beside what is expected", "train with model.scatter=false first"
-    require(begun, "training.start_from", "null with model.scatter=true", bundled, remedy)
     if start is not None:
         here, there = (
             flat({"model": asdict(m), "requires": asdict(r)})
             for m, r in ((config, requires), (start.config, start.requires))
         )
         # turned windows and left out edges are matters of training; networks do not know of them
-        elsewhere = (
-            "model.scatter",  # beside what is expected, and learned after it
-            "requires.reasons",
-            "requires.symmetry",
-            "requires.touching_pairs",
-            "requires.nearest_points",
-        )
+        elsewhere = ("requires.reasons", "requires.symmetry", "requires.touching_pairs", "requires.nearest_points")
         differ = [key for key in sorted({*here, *there}) if here.get(key) != there.get(key)]
         can_gain = start.config.network == "impulse" and not start.requires.material_features
         gained = requires.material_features if can_gain else []

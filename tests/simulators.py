@@ -35,7 +35,6 @@ PAPER = {
     "skip": False,
 }
 IMPULSE = {"network": "impulse"}
-SCATTER = IMPULSE | {"scatter": True}
 TOUCHING = IMPULSE | {"touching_pairs": True}
 STATISTICS = dict(
     velocity_m_s=0.5,

@@ -75,7 +75,7 @@ class Captured:
         """The next state, as `Simulator.advance` gives it, and the capacities it would have needed: right only if they
         are no more than there were."""
         graph, needed = self.graph(state)
-        correction = self.simulator.effects(_one_more(state), graph, drawn=True)[:-1]
+        correction = self.simulator.effects(_one_more(state), graph)[:-1]
         if state.active is not None:
             correction = torch.where(state.active[:, None], correction, 0.0)
         return self.simulator.advance(state, correction), needed

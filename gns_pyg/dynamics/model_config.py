@@ -19,8 +19,6 @@ class ModelConfig:
             (`models.contact_network`, the paper's); `impulse` has every contact exchange impulses, equal and opposite
             (`models.impulse_network`).
         channels: vectors that a grain carries between the rounds of an impulse network.
-        scatter: contacts of an impulse network also say how widely their answer scatters, and roll-outs draw from that
-            (`models.scatter`). Trained alone, on top of the bundle `training.start_from`.
         absolute_position: give networks the absolute position (the paper; breaks translation invariance).
         contact_features: gap, approach and slip on edges, beside the geometry of Mayr et al.
         self_loops: an edge from every grain to itself, so that one without neighbours is computed too (the paper).
@@ -34,7 +32,6 @@ class ModelConfig:
 
     network: str = "message"
     channels: int = 6
-    scatter: bool = False
     absolute_position: bool = MISSING
     contact_features: bool = MISSING
     self_loops: bool = MISSING
@@ -57,8 +54,6 @@ class ModelConfig:
             for key, needed in needs.items():
                 value, expected = getattr(self, key), f"{needed} with model.network=impulse"
                 require(value == needed, f"model.{key}", value, expected.lower(), "see conf/model/impulse.yaml")
-        impulses = self.network == "impulse" or not self.scatter
-        require(impulses, "model.scatter", "true", "false with model.network=message", "see conf/model/impulse.yaml")
         for key, least in (("channels", 3), ("hidden", 1), ("layers", 1), ("mlp_layers", 2), ("projection_sweeps", 0)):
             value = getattr(self, key)
             require(value >= least, f"model.{key}", value, f"at least {least}", f"set model.{key} to {least} or more")

@@ -25,7 +25,6 @@ from gns_pyg.graph.neighbors import backend, pairs
 from gns_pyg.models.contact_network import ContactNetwork
 from gns_pyg.models.impulse_network import GAINED, MEAN, VELOCITY, Damping, Grains, ImpulseNetwork, exchange
 from gns_pyg.models.mlp import mlp
-from gns_pyg.models.scatter import Scatter, covariance, drawn_changes
 from gns_pyg.models.statistics import Statistics
 from gns_pyg.scene.boundary_points import BoundaryPoints
 from gns_pyg.scene.free_flight import cundall
@@ -108,10 +107,7 @@ class Simulator(nn.Module):
         require(
             requires.free_flight, "requires.free_flight", "false with model.network=impulse", known, "set it to auto"
         )
-        apart = not config.scatter or self.integrator.n_groups > 1
-        expected = "velocity or full with model.scatter: what scatters is the end velocity"
-        require(apart, "requires.state", requires.state, expected, "set it to auto")
-        width = {key: getattr(config, key) for key in ("hidden", "layers", "mlp_layers", "channels", "scatter")}
+        width = {key: getattr(config, key) for key in ("hidden", "layers", "mlp_layers", "channels")}
         n_grain = 2 + requires.radius_features + len(self._conditions)
         self.encode_grain = mlp(n_grain, config.hidden, config.hidden, config.mlp_layers, layer_norm=True)
         n_scalar, n_basis = contacts.N_SCALARS, contacts.N_BASIS
@@ -123,11 +119,7 @@ class Simulator(nn.Module):
             self.wall_network = ImpulseNetwork(n_scalar=n_scalar, n_basis=n_basis, mutual=False, **width)
 
     def forward(self, state: State) -> State:
-        """Moves every grain by one frame; what scatters (`model.scatter`) is drawn."""
-        return self.guarded(state, self.advance(state, self.correction(state, drawn=True)))
-
-    def expected(self, state: State) -> State:
-        """Moves every grain by one frame, by what is expected of it."""
+        """Moves every grain by one frame."""
         return self.guarded(state, self.advance(state, self.correction(state)))
 
     def advance(self, state: State, correction: Float[Tensor, "n_grains d"]) -> State:
@@ -167,48 +159,32 @@ class Simulator(nn.Module):
         """The value of `correction` that takes `state` to `following`; what training aims at."""
         return (self.integrator.target(state, following) / self.scale).to(self.scale.dtype)
 
-    def correction(self, state: State, *, drawn: bool = False) -> Float[Tensor, "n_grains d"]:
-        """What contacts add, over `scale`; 0 for a grain that is not active. Expected, or `drawn`."""
+    def correction(self, state: State) -> Float[Tensor, "n_grains d"]:
+        """What contacts add, over `scale`; 0 for a grain that is not active."""
         if state.active is None:
-            return self._contacts(state, drawn)
-        there = self._contacts(replace(state.pick(state.active), active=None), drawn)
+            return self._contacts(state)
+        there = self._contacts(replace(state.pick(state.active), active=None))
         return there.new_zeros(len(state.pos), there.shape[1]).masked_scatter(state.active[:, None], there)
 
-    def _contacts(self, state: State, drawn: bool) -> Float[Tensor, "n_grains d"]:
+    def _contacts(self, state: State) -> Float[Tensor, "n_grains d"]:
         most = self.execution.tile_grains
         if most is None or len(state.pos) <= most:
-            return self.effects(state, self.graph(state), drawn=drawn)
+            return self.effects(state, self.graph(state))
         total = self.scale.new_empty(len(state.pos), len(self.scale))
         for core, region in tiles(state.pos.detach(), most, self.halo_m):
             near = state.pick(region)
-            total[core] = self.effects(near, self.graph(near), drawn=drawn)[torch.searchsorted(region, core)]
+            total[core] = self.effects(near, self.graph(near))[torch.searchsorted(region, core)]
         return total
 
-    def effects(self, state: State, graph: Graph, *, drawn: bool = False) -> Float[Tensor, "n_grains d"]:
-        """What the contacts of `graph` add, over `scale`; 0 for a grain without an edge. See `correction`."""
-        total, kinds = self._scattered(state, graph)
-        if not (drawn and kinds):
-            return total
-        ends = [(state.pos, graph.grain_edges)] + ([] if graph.walls is None else [(graph.walls.pos, graph.wall_edges)])
-        places = [pos[sender] for pos, (sender, _) in ends]
-        change = drawn_changes(state.pos, kinds, places) * self.statistics.velocity_m_s
-        mean, end, *spin = total.split(3, dim=1)
-        return torch.cat([mean, end + change / self.scale[3:6], *spin], dim=1)
-
-    def scattered(self, state: State) -> tuple[Float[Tensor, "n_grains d"], Float[Tensor, "n_grains 3 3"]]:
-        """`correction`, all grains active, and how widely end velocities scatter about it: their covariance, over the
-        square of the velocity scale. With `model.scatter`."""
-        total, kinds = self._scattered(state, self.graph(state))
-        return total, covariance(len(state.pos), kinds)
-
-    def _scattered(self, state: State, graph: Graph) -> tuple[Float[Tensor, "n_grains d"], list[Scatter]]:
+    def effects(self, state: State, graph: Graph) -> Float[Tensor, "n_grains d"]:
+        """What the contacts of `graph` add, over `scale`; 0 for a grain without an edge."""
         self.edges_done += graph.grain_edges.shape[1] + graph.wall_edges.shape[1]
         where, cast = self.scale.device.type, self.execution.autocast
         with torch.autocast(where, cast) if cast else nullcontext():
             return self._impulses(state, graph) if self.config.network == "impulse" else self._messages(state, graph)
 
-    def _messages(self, state: State, graph: Graph) -> tuple[Float[Tensor, "n_grains d"], list[Scatter]]:
-        """The paper's equation (10): the sum of two networks; nothing scatters."""
+    def _messages(self, state: State, graph: Graph) -> Float[Tensor, "n_grains d"]:
+        """The paper's equation (10): the sum of two networks."""
         grains = self._grain_features(state)
         options: dict[str, Any] = dict(
             velocity_m_s=self.statistics.velocity_m_s,
@@ -222,9 +198,9 @@ class Simulator(nn.Module):
             edges = features.wall_edges(state, graph, graph.walls, **options)
             points = self._wall_features(graph.walls)
             total = total + self.wall_network(points, grains, edges, graph.wall_edges).to(self.scale.dtype)
-        return total, []
+        return total
 
-    def _impulses(self, state: State, graph: Graph) -> tuple[Float[Tensor, "n_grains d"], list[Scatter]]:
+    def _impulses(self, state: State, graph: Graph) -> Float[Tensor, "n_grains d"]:
         """Two networks that take turns on the same grains, from what these would do under gravity alone."""
         velocity_m_s, dtype, dt_s = self.statistics.velocity_m_s, self.scale.dtype, self.scene.frame_dt_s
         free_vel = state.vel + constant(self.scene.gravity_m_s2, state.vel) * dt_s
@@ -237,13 +213,13 @@ class Simulator(nn.Module):
         if isinstance(self.wall_network, ImpulseNetwork) and graph.walls is not None:
             options |= dict(friction=self.requires.wall_friction, moving=self.requires.wall_velocity)
             kinds.append((self.wall_network, contacts.wall_contacts(state, free_vel, graph, graph.walls, **options)))
-        after, scatter = exchange(grains, kinds)
+        after = exchange(grains, kinds)
         vel, spin = after.vel - grains.vel, after.spin - grains.spin
         groups = [vel[:, :, MEAN], vel[:, :, VELOCITY], spin[:, :, VELOCITY] + spin[:, :, MEAN]]
         if self.requires.damped:
             groups = self._damped(state, free_vel, graph, groups, self.damping(grains, after, slow))
         groups[2] = groups[2] / state.radius[:, None].to(dtype)
-        return torch.cat(groups[: self.integrator.n_groups], dim=1) * velocity_m_s / self.scale, scatter
+        return torch.cat(groups[: self.integrator.n_groups], dim=1) * velocity_m_s / self.scale
 
     def _damped(
         self,

@@ -219,15 +219,14 @@ def _run(simulator: Simulator, state: State, n_frames: int, steps: int, see: Cal
 @torch.inference_mode()
 def one_step_errors(simulator: Simulator, trajectory: Trajectory, batch_size: int = 4) -> np.ndarray:
     """Mean position error (the paper's (13)), m, one frame after every recorded state: of frames 2 to the last, over
-    the grains present in the frame and the two before it (see `trivial_errors`). Of what is expected: nothing that
-    scatters is drawn."""
+    the grains present in the frame and the two before it (see `trivial_errors`)."""
     errors, steps = [], steps_per_frame(simulator, trajectory)
     for first in range(0, trajectory.n_frames - 2, batch_size):
         frames = range(first, min(first + batch_size, trajectory.n_frames - 2))
         state, window = _recorded(simulator, trajectory, frames, 3)
         state, truth = state.to(simulator.scale.device), window.pos[2]
         for _ in range(steps):
-            state = simulator.expected(state)
+            state = simulator(state)
         if window.active is not None:
             truth = torch.where(window.active.all(dim=0)[:, None], truth, torch.nan)
         shape = (len(frames), trajectory.n_grains, 3)

@@ -19,14 +19,11 @@ from torch.nn.functional import embedding_bag
 from torch_geometric.nn import MessagePassing
 
 from gns_pyg.models.mlp import ROWS, blocks, linear, mlp, only, recurring
-from gns_pyg.models.scatter import Scatter
 from gns_pyg.state import Contacts, fine, reached
 
 VELOCITY, MEAN, GAINED = 0, 1, 2  # channels: end velocity, mean velocity's correction, what gravity adds in a frame
 SPHERE = 2.5  # m r^2 / I: what a tangential impulse turns it
 FASTEST = 30.0  # of the velocity scale: what answers a slip in proportion stays below; nothing grows without end
-TREMBLES = (-10.0, 3.0)  # logarithm of how many times the speed of its grains a contact's answer may scatter
-WIDEST = 0.2  # of the velocity scale: it scatters no more widely; faster grains' blows are known well enough
 SOFT = 1e-6  # under the root of a squared length, so that its gradient stays finite
 
 
@@ -78,20 +75,10 @@ class ImpulseNetwork(nn.Module):
         mutual: both sides are grains; else one is a wall, which nothing moves.
         hidden, layers, mlp_layers: width, rounds, linear layers of each MLP.
         channels: vectors that a grain carries, at least three.
-        scatter: contacts say how widely their answer scatters (see `models.scatter`).
     """
 
     def __init__(
-        self,
-        *,
-        n_scalar: int,
-        n_basis: int,
-        mutual: bool,
-        hidden: int,
-        layers: int,
-        mlp_layers: int,
-        channels: int,
-        scatter: bool,
+        self, *, n_scalar: int, n_basis: int, mutual: bool, hidden: int, layers: int, mlp_layers: int, channels: int
     ) -> None:
         super().__init__()
         self.hidden, self.mutual = hidden, mutual
@@ -100,12 +87,6 @@ class ImpulseNetwork(nn.Module):
             ImpulseRound(hidden, mlp_layers, channels, n_basis, mutual=mutual, last=turn == layers - 1)
             for turn in range(layers)
         )
-        self.spread = mlp(hidden, hidden, 2, 2) if scatter else None
-        if self.spread is not None:
-            with torch.no_grad():  # begin narrow
-                final = list(self.spread[-1].parameters())
-                final[0].mul_(0.1)
-                final[-1].fill_(-1.5)
 
     def hears(self, n: int, contacts: Contacts) -> Bool[Tensor, " n"]:
         """Which of `n` grains have a contact of this kind."""
@@ -131,25 +112,6 @@ class ImpulseNetwork(nn.Module):
         if edges is None:
             edges = [self.encode(piece.scalars) for piece in contacts]
         return self.rounds[turn](grains, contacts, edges, hears)
-
-    def scatter(
-        self, contacts: Contacts, told: Sequence[Piece], edges: Sequence[Tensor], speed: Float[Tensor, " n"]
-    ) -> Scatter:
-        """How widely the answer of `contacts` scatters: so many times the mean speed of their grains.
-
-        Args:
-            contacts: of this kind.
-            told: the same in pieces.
-            edges: their latents after the last round.
-            speed: of every grain, over the velocity scale.
-        """
-        assert self.spread is not None
-        rows = [self.spread(edge)[: len(piece.told[0])] for piece, edge in zip(told, edges, strict=True)]
-        sides = tuple(contacts.ends.flip(0)[: 1 + self.mutual])
-        mean = torch.stack([speed[side] for side in sides]).mean(0)
-        width = (torch.cat(rows).to(speed.dtype).clamp(*TREMBLES).exp() * mean[:, None]).clamp(max=WIDEST)
-        share = None if contacts.share is None else contacts.share.flip(1).split(1, dim=1)
-        return Scatter(sides, contacts.basis[:, :, 0], width, share)
 
 
 class ImpulseRound(MessagePassing):
@@ -292,20 +254,13 @@ def cross(a: Float[Tensor, "3 channels e"], b: Float[Tensor, "3 1 e"]) -> Float[
     return torch.stack([y * w - z * v, z * u - x * w, x * v - y * u])
 
 
-def exchange(grains: Grains, kinds: Sequence[tuple[ImpulseNetwork, Contacts]]) -> tuple[Grains, list[Scatter]]:
-    """What grains carry after all rounds, in which the kinds of contact take turns, and how widely that of each kind
-    scatters, if the networks say so."""
-    n, start = len(grains.latent), grains.vel[:, :, VELOCITY] - grains.vel[:, :, GAINED]
+def exchange(grains: Grains, kinds: Sequence[tuple[ImpulseNetwork, Contacts]]) -> Grains:
+    """What grains carry after all rounds, in which the kinds of contact take turns."""
+    n = len(grains.latent)
     lots = [pieces(contacts, network.hidden, n, mutual=network.mutual) for network, contacts in kinds]
     hears = [network.hears(n, contacts) for network, contacts in kinds]
     edges: list[list[Tensor] | None] = [None] * len(kinds)
     for turn in range(len(kinds[0][0].rounds)):
         for kind, (network, _) in enumerate(kinds):
             grains, edges[kind] = network(turn, grains, lots[kind], edges[kind], hears[kind])
-    speed = (start.norm(dim=1) + grains.vel[:, :, VELOCITY].norm(dim=1)) / 2
-    scattered = [
-        network.scatter(contacts, told, latents or (), speed)
-        for (network, contacts), told, latents in zip(kinds, lots, edges, strict=True)
-        if network.spread is not None
-    ]
-    return grains, scattered
+    return grains

@@ -13,7 +13,6 @@ import torch
 from jaxtyping import Float, Int
 from torch import Tensor
 from torch import distributed as dist
-from torch.distributions import MultivariateNormal
 
 CELLS = ((8.0, 1.0), (17.6, 10.0))  # edge in radii, weight: 30 and 300 grains of a dense bed; scatter weighs alike
 
@@ -41,13 +40,6 @@ def balance_loss(error: Float[Tensor, "n 3"], vel: Float[Tensor, "n 3"], cell: I
     count = torch.bincount(cell)
     total = rows.new_zeros(len(count), 4).index_add_(0, cell, rows)
     return (total.square().sum(1) / count).sum() / max(len(rows), 1)
-
-
-def scatter_loss(error: Float[Tensor, "n 3"], covariance: Float[Tensor, "n 3 3"]) -> Float[Tensor, ""]:
-    """Mean of -log N(error; 0, covariance), how unlikely errors of end velocities are where they scatter so widely; 0
-    where there is none."""
-    normal = MultivariateNormal(torch.zeros_like(error), covariance)
-    return -normal.log_prob(error).sum() / max(len(error), 1)
 
 
 def cells(

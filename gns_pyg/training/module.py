@@ -1,7 +1,6 @@
 """What Lightning drives: one update of a simulator."""
 
 from collections.abc import Mapping, Sequence
-from dataclasses import replace
 from typing import Any, cast
 
 import numpy as np
@@ -19,7 +18,7 @@ from gns_pyg.state import State, Window
 from gns_pyg.training.augment import transform
 from gns_pyg.training.checkpoint import REMEDY
 from gns_pyg.training.config import TrainingConfig
-from gns_pyg.training.loss import CELLS, balance_loss, cells, mean_loss, scatter_loss, share_of_mean
+from gns_pyg.training.loss import CELLS, balance_loss, cells, mean_loss, share_of_mean
 from gns_pyg.training.noise import perturb
 
 MOST = 1e15  # of any number in a checkpoint beside its tensors
@@ -30,10 +29,9 @@ class TrainingModule(pl.LightningModule):
 
     The loss is the mean square of the scaled correction's error: for position-only states the paper's (12) up to a
     constant factor; or, with `loss_knee`, its mean length, which a few violent contacts do not rule. `balance` adds
-    what grains wrongly gain or lose together. With `model.scatter` the loss is how unlikely the DEM's end velocities
-    are (`scatter_loss`), and only how widely contacts scatter is learned: what is expected stays. Noise and unrolling
-    are drawn from the seed, the update's number and the window's place in its batch, so a resumed run repeats none and
-    skips none, and several processes that share a batch compute what one would.
+    what grains wrongly gain or lose together. Noise and unrolling are drawn from the seed, the update's number and the
+    window's place in its batch, so a resumed run repeats none and skips none, and several processes that share a batch
+    compute what one would.
 
     Args:
         simulator: what is trained.
@@ -45,10 +43,6 @@ class TrainingModule(pl.LightningModule):
         super().__init__()
         self.simulator, self.config, self.identity = simulator, config, dict(identity or {})
         self.symmetry, self.started = symmetry(simulator.scene), False
-        if simulator.config.scatter:
-            for name, weights in simulator.named_parameters():
-                weights.requires_grad_(".spread." in name)
-        self.learned = [weights for weights in simulator.parameters() if weights.requires_grad]
         self.average: AveragedModel | None = None
         if config.average_decay:
             self.average = AveragedModel(simulator, multi_avg_fn=get_ema_multi_avg_fn(config.average_decay))
@@ -118,7 +112,7 @@ class TrainingModule(pl.LightningModule):
         expected: dict[str, Tensor] = dict(self.state_dict())
         found: dict[str, Any] = dict(checkpoint["state_dict"])
         (optimizer,) = checkpoint["optimizer_states"]
-        for number, parameter in enumerate(self.learned):
+        for number, parameter in enumerate(self.simulator.parameters()):
             for name, like in {"exp_avg": parameter, "exp_avg_sq": parameter, "step": torch.zeros(())}.items():
                 if number in optimizer["state"]:
                     expected[f"{name} {number}"] = like
@@ -151,14 +145,11 @@ class TrainingModule(pl.LightningModule):
             core, region = ball(state.pos, state.batch, self.config.region_grains, self.simulator.halo_m, randoms)
             counted = (counted & torch.zeros_like(counted).index_fill(0, core, True))[region]
             state, following = state.pick(region), following.pick(region)
-        if self.simulator.config.scatter:
-            loss = self._unlikeliness(state, following, counted)
-        else:
-            error = (self.simulator.correction(state) - self.simulator.target(state, following))[counted]
-            loss = mean_loss(error, self.config.loss_knee)
-            if self.config.balance:
-                loss = loss + self.config.balance * self._imbalance(error, state, following, counted, randoms)
-        loss = loss * share_of_mean(int(counted.sum()), counted.device)
+        error = (self.simulator.correction(state) - self.simulator.target(state, following))[counted]
+        loss = mean_loss(error, self.config.loss_knee)
+        if self.config.balance:
+            loss = loss + self.config.balance * self._imbalance(error, state, following, counted, randoms)
+        loss = loss * share_of_mean(len(error), error.device)
         if not torch.isfinite(loss):
             raise NumericalError(
                 f"training update {self.global_step}",
@@ -169,28 +160,14 @@ class TrainingModule(pl.LightningModule):
         self.log("train/loss", loss, batch_size=state.n_graphs, sync_dist=True)
         return loss
 
-    def _unlikeliness(self, state: State, following: State, counted: Tensor) -> Tensor:
-        """`scatter_loss` of the `counted` grains, none of which is absent."""
-        if state.active is not None:
-            there, following = replace(state.pick(state.active), active=None), following.pick(state.active)
-            state, counted = there, counted[state.active]
-        correction, covariance = self.simulator.scattered(state)
-        error = self._end_error(correction - self.simulator.target(state, following))
-        return scatter_loss(error[counted], covariance[counted])
-
-    def _end_error(self, error: Tensor) -> Tensor:
-        """Of end velocities, over the data's scale."""
-        simulator = self.simulator
-        end = slice(3, 6) if simulator.integrator.n_groups > 1 else slice(3)  # with differences mean and end are one
-        return error[:, end] * simulator.scale[end] / simulator.statistics.velocity_m_s
-
     def _imbalance(
         self, error: Tensor, state: State, following: State, counted: Tensor, randoms: Sequence[torch.Generator]
     ) -> Tensor:
         """`balance_loss` of the `counted` grains in cells of every size, velocities over the data's scale."""
         simulator, (pos, batch, vel) = self.simulator, (x[counted] for x in (state.pos, state.batch, following.vel))
         velocity_m_s, radius_m = simulator.statistics.velocity_m_s, max(simulator.scene.grains.radii_m)
-        error = self._end_error(error)
+        end = slice(3, 6) if simulator.integrator.n_groups > 1 else slice(3)  # with differences mean and end are one
+        error = error[:, end] * simulator.scale[end] / velocity_m_s
         vel = (vel / velocity_m_s).to(error.dtype)
         terms = [
             weight * balance_loss(error, vel, cells(pos, batch, edge * radius_m, randoms)) for edge, weight in CELLS
@@ -210,7 +187,7 @@ class TrainingModule(pl.LightningModule):
         return steps if unrolls and started else 0
 
     def configure_optimizers(self) -> OptimizerLRScheduler:
-        optimizer = torch.optim.Adam(self.learned, lr=self.config.lr_start)
+        optimizer = torch.optim.Adam(self.simulator.parameters(), lr=self.config.lr_start)
         stretch = self.config.updates / (self.config.halvings + 1)
         schedule = torch.optim.lr_scheduler.LambdaLR(
             optimizer, lambda update: 0.5 ** min(int(update / stretch), self.config.halvings)

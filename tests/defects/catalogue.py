@@ -33,7 +33,6 @@ class Defect:
 
 FEATURES, NETWORK = "gns_pyg/graph/features.py", "gns_pyg/models/contact_network.py"
 IMPULSES = "gns_pyg/models/impulse_network.py"
-SCATTER = "gns_pyg/models/scatter.py"
 FLIGHT, INTEGRATOR = "gns_pyg/scene/free_flight.py", "gns_pyg/dynamics/integrator.py"
 SIMULATOR, BOUNDARY = "gns_pyg/dynamics/simulator.py", "gns_pyg/dynamics/boundary.py"
 TRAINING = "gns_pyg/training/module.py"
@@ -283,20 +282,6 @@ DEFECTS = [
         "gained + told * sign if side",
         "gained + torch.cat([told[:, :heard], -told[:, heard:]], dim=1) if side",
         ("tests/models/test_impulse_network.py::test_a_tangential_impulse_turns_both_grains_alike",),
-    ),
-    Defect(
-        "what is drawn given to both grains alike",
-        SCATTER,
-        "zip(kind.sides, (1, -1), strict=False)",
-        "zip(kind.sides, (1, 1), strict=False)",
-        ("tests/models/test_scatter.py::test_what_is_drawn_scatters_as_widely_as_is_said_and_keeps_momentum",),
-    ),
-    Defect(
-        "what is drawn is of the grains' numbers too",
-        SCATTER,
-        "turn = torch.where(own < other, 1.0, -1.0)",
-        "turn = torch.where(own < other, 1.0, 1.0)",
-        ("tests/models/test_scatter.py::test_what_is_drawn_is_of_the_state_alone",),
     ),
     Defect(
         "graphs of a batch see each other's walls",

@@ -44,7 +44,6 @@ def test_the_step_is_the_simulator_s(scene, n_per_graph) -> None:
     [
         simulators.PAPER,
         simulators.IMPULSE,
-        simulators.SCATTER,
         simulators.TOUCHING,
         {"touching_pairs": True},
         {"nearest_points": True},

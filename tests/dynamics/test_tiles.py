@@ -53,7 +53,6 @@ def test_a_ball_is_the_nearest_grains_of_each_graph_and_its_margin() -> None:
         {"self_loops": True},
         simulators.PAPER,
         simulators.IMPULSE,
-        simulators.SCATTER,
         simulators.TOUCHING,
     ],
 )

@@ -21,7 +21,7 @@ from gns_pyg.scene.requirements import Requires, resolve
 from gns_pyg.scene.scene import Motion, Scene
 from gns_pyg.state import State
 from tests.scenes import scene
-from tests.simulators import IMPULSE, MODEL, PAPER, SCATTER
+from tests.simulators import IMPULSE, MODEL, PAPER
 
 SIZES = {"one": (1.0,), "two": (0.4, 1.0), "far apart": (0.01, 1.0)}
 MODELS: dict[str, dict[str, Any]] = {
@@ -30,7 +30,6 @@ MODELS: dict[str, dict[str, Any]] = {
     "differences": {"state": "differences", "skip": False},
     "paper": PAPER,
     "impulse": IMPULSE,
-    "scatter": SCATTER,
     "impulse, differences": IMPULSE | {"state": "differences"},
 }
 MATERIAL = vars(scene(1, 5).grains.material)

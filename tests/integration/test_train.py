@@ -127,23 +127,6 @@ def test_a_share_of_the_old_weights_stays(trained, tmp_path):
         train(tmp_path / "none", "experiment=hopper", "training.start_share=0.5")
 
 
-def test_what_scatters_is_learned_beside_what_is_expected(trained, tmp_path):
-    start = f"training.start_from={trained[0] / 'bundle'}"
-    overrides = ["experiment=hopper", "model.scatter=true", "training.updates=4", "training.unroll=0", start]
-    metrics, before = train(tmp_path / "one", *overrides), weights(trained[0])
-    found = weights(tmp_path / "one")
-    assert {key.split(".")[1] for key in found.keys() - before.keys()} == {"spread"}
-    assert all(torch.equal(found[key], before[key]) for key in before)
-    assert metrics["test/one_step_error_m"] == pytest.approx(trained[1]["test/one_step_error_m"], rel=1e-6)
-    assert metrics["test/rollout_error_final_m"] != pytest.approx(trained[1]["test/rollout_error_final_m"], rel=1e-3)
-    checkpoint = tmp_path / "one" / "checkpoints" / "last.ckpt"
-    train(tmp_path / "more", *overrides, "training.updates=6", f"ckpt_path={checkpoint}")
-    more = weights(tmp_path / "more")
-    assert {key.split(".")[1] for key in found if not torch.equal(found[key], more[key])} == {"spread"}
-    with pytest.raises(ConfigError, match=r"training\.start_from"):
-        train(tmp_path / "none", *overrides[:4])
-
-
 def test_bundle_equals_checkpoint(trained):
     """The bundle holds the averaged weights of the last checkpoint."""
     checkpoint = torch.load(trained[0] / "checkpoints" / "last.ckpt", weights_only=True)["state_dict"]
