@@ -91,14 +91,13 @@ def trained(cfg: DictConfig) -> tuple[Simulator, Split, Climatology, dict[str, A
     model = typed(ModelConfig, cfg.model, "model")
     data = typed(DataConfig, cfg.data, "data")
     forced = typed(Requires, cfg.requires, "requires")
-    for key in ("unroll", "creep"):
-        require(
-            not (data.answers and getattr(training, key)),
-            f"training.{key}",
-            f"{getattr(training, key)} with data.answers",
-            "0: answers are single frames, and tell what own steps would",
-            f"set training.{key}=0",
-        )
+    require(
+        not (data.answers and training.unroll),
+        "training.unroll",
+        f"{training.unroll} with data.answers",
+        "0: answers are single frames, and tell what own steps would",
+        "set training.unroll=0",
+    )
     cases, before = split(scene, data), bundle.card(training.start_from) if training.start_from else {}
     if before:
         unseen = [case for case in cases.test if not seen(case, scene, before)]

@@ -127,18 +127,6 @@ def test_a_share_of_the_old_weights_stays(trained, tmp_path):
         train(tmp_path / "none", "experiment=hopper", "training.start_share=0.5")
 
 
-def test_creep_is_part_of_the_loss_and_asks_for_frames(tmp_path):
-    overrides = ["experiment=hopper", "training.updates=2", "training.unroll=0", "data.test_fraction=0"]
-    train(tmp_path / "one", *overrides)
-    train(tmp_path / "two", *overrides, "training.creep=1", "training.creep_steps=3")
-    one, two = weights(tmp_path / "one"), weights(tmp_path / "two")
-    assert any(not torch.equal(one[key], two[key]) for key in one)
-    with pytest.raises(DataError, match="creep_steps"):
-        train(tmp_path / "long", *overrides, "training.creep=1", "training.creep_steps=500")
-    with pytest.raises(ConfigError, match=r"training\.creep"):
-        train(tmp_path / "answers", *overrides, "training.creep=1", "data.answers=[somewhere]")
-
-
 def test_bundle_equals_checkpoint(trained):
     """The bundle holds the averaged weights of the last checkpoint."""
     checkpoint = torch.load(trained[0] / "checkpoints" / "last.ckpt", weights_only=True)["state_dict"]
