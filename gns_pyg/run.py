@@ -91,14 +91,13 @@ def trained(cfg: DictConfig) -> tuple[Simulator, Split, Climatology, dict[str, A
     model = typed(ModelConfig, cfg.model, "model")
     data = typed(DataConfig, cfg.data, "data")
     forced = typed(Requires, cfg.requires, "requires")
-    for key in ("unroll", "creep"):
-        require(
-            not (data.answers and getattr(training, key)),
-            f"training.{key}",
-            f"{getattr(training, key)} with data.answers",
-            "0: answers are single frames, and tell what own steps would",
-            f"set training.{key}=0",
-        )
+    require(
+        not (data.answers and training.unroll),
+        "training.unroll",
+        f"{training.unroll} with data.answers",
+        "0: answers are single frames, and tell what own steps would",
+        "set training.unroll=0",
+    )
     cases, before = split(scene, data), bundle.card(training.start_from) if training.start_from else {}
     if before:
         unseen = [case for case in cases.test if not seen(case, scene, before)]
@@ -280,7 +279,7 @@ def build(
             for m, r in ((config, requires), (start.config, start.requires))
         )
         # turned windows and left out edges are matters of training; networks do not know of them
-        elsewhere = ("model.channels", "requires.reasons", "requires.symmetry", "requires.touching_pairs", "requires.nearest_points")
+        elsewhere = ("requires.reasons", "requires.symmetry", "requires.touching_pairs", "requires.nearest_points")
         differ = [key for key in sorted({*here, *there}) if here.get(key) != there.get(key)]
         can_gain = start.config.network == "impulse" and not start.requires.material_features
         gained = requires.material_features if can_gain else []
@@ -306,16 +305,6 @@ def build(
         networks = {key: value for key, value in start.state_dict().items() if not key.startswith("boundary.")}
         if gained:
             networks[ENCODER] = nn.functional.pad(networks[ENCODER], (0, len(gained)))  # its last inputs
-        old, new = start.config.channels, config.channels
-        for key, value in networks.items() if old != new else ():
-            if key.endswith("from_seen.weight"):
-                networks[key] = nn.functional.pad(value.view(len(value), -1, old), (0, new - old)).flatten(1)
-            elif "impulse_mlp.2" in key:
-                v = value.view(-1, old, *value.shape[1:])
-                networks[key] = torch.cat([v, v.new_zeros(len(v), new - old, *v.shape[2:])], 1).flatten(0, 1)
-            elif key == "damping.shares.0.weight":
-                h = config.hidden
-                networks[key] = torch.cat([value[:, :h], nn.functional.pad(value[:, h:].view(len(value), 6, old), (0, new - old)).flatten(1)], 1)
         simulator.load_state_dict(networks, strict=False)
     return simulator
 

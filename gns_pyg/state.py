@@ -84,7 +84,6 @@ class State(Record):
     batch: Int[Tensor, " n_grains"]
     parameters: Float[Tensor, "n_graphs n_parameters"] | None = None
     active: Bool[Tensor, " n_grains"] | None = None
-    drift: Tensor | None = None
 
     @property
     def n_graphs(self) -> int:
@@ -99,7 +98,6 @@ class State(Record):
             ang_vel=None if self.ang_vel is None else self.ang_vel[grains],
             radius=self.radius[grains],
             batch=self.batch[grains],
-            drift=None if self.drift is None else self.drift[grains],
             active=None if self.active is None else self.active[grains],
         )
 

@@ -17,19 +17,6 @@ from gns_pyg.scene.scene import PARAMETERS, STATES, Scene
 from gns_pyg.state import State, Window
 
 
-import os
-MEMORY, BEFORE = float(os.environ.get("MEMORY", 8)), int(os.environ.get("BEFORE", 24))
-
-
-def drifted(pos, frame, dt_s):
-    n = min(frame, BEFORE)
-    if n == 0:
-        return None
-    u = (pos[frame - n + 1 : frame + 1] - pos[frame - n : frame]) / dt_s
-    w = (1 - 1 / MEMORY) ** torch.arange(n - 1, -1, -1, dtype=pos.dtype)
-    return (u * (w / w.sum())[:, None, None]).sum(0)
-
-
 class Integrator:
     """Moves a state by one frame.
 
@@ -61,7 +48,6 @@ class Integrator:
             batch=window.batch,
             parameters=window.parameters,
             active=None if window.active is None else window.active[frame],
-            drift=drifted(window.pos, frame, self.dt_s),
         )
 
     def without_contact(self, state: State) -> State:

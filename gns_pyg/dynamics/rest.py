@@ -14,9 +14,7 @@ from torch import Tensor
 
 from gns_pyg.state import State
 
-import os
-
-REST = float(os.environ.get('REST', 0.15))  # of the way that the speed of a step of free flight from rest would carry a grain
+REST = 0.15  # of the way that the speed of a step of free flight from rest would carry a grain
 
 
 def rested(before: State, after: State, gained_m_s: Float[Tensor, " n_grains"], dt_s: float) -> State:

@@ -14,7 +14,7 @@ from gns_pyg.dynamics.boundary import Boundary
 from gns_pyg.dynamics.execution import Execution
 from gns_pyg.dynamics.free_grains import MARGIN_RADII, among, can_meet, can_touch, meeting, pair_margin_m
 from gns_pyg.dynamics.guard import Guard
-from gns_pyg.dynamics.integrator import MEMORY, Integrator
+from gns_pyg.dynamics.integrator import Integrator
 from gns_pyg.dynamics.model_config import ModelConfig
 from gns_pyg.dynamics.passage import Passage
 from gns_pyg.dynamics.projection import separated
@@ -120,11 +120,7 @@ class Simulator(nn.Module):
 
     def forward(self, state: State) -> State:
         """Moves every grain by one frame."""
-        if state.drift is None:
-            state = replace(state, drift=state.vel)
-        after = self.guarded(state, self.advance(state, self.correction(state)))
-        moved = (after.pos - state.pos) / self.scene.frame_dt_s
-        return replace(after, drift=state.drift + (moved - state.drift) / MEMORY)
+        return self.guarded(state, self.advance(state, self.correction(state)))
 
     def advance(self, state: State, correction: Float[Tensor, "n_grains d"]) -> State:
         """The next state, given what contacts add, as if no grain could go through a wall."""
@@ -261,7 +257,6 @@ class Simulator(nn.Module):
         latent = self.encode_grain(torch.cat(columns + self._kinds(state), dim=1).to(dtype))
         carried = state.vel.new_zeros(2, len(state.vel), 3, self.config.channels)
         carried[0, :, :, VELOCITY], carried[0, :, :, GAINED] = free_vel, free_vel - state.vel
-        carried[0, :, :, -1] = state.vel if state.drift is None else state.drift
         carried[1, :, :, VELOCITY] = state.radius[:, None] * ang_vel
         return Grains(latent, *(carried / velocity_m_s).to(dtype))
 

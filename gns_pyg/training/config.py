@@ -31,10 +31,6 @@ class TrainingConfig:
         balance: weight of the momentum and the energy that cells of some 30 and 300 grains wrongly gain or lose
             together. (Each grain's own error is smallest for an average motion, which loses speed at every step.) 0
             leaves it out.
-        creep: weight of the momentum that cells of grains about as fast wrongly gain, over their own speed, in
-            `creep_steps` of the model's own steps and in half of them, from one whole frame of every update; gradients
-            run through all these steps, each of which takes the time and memory of an update. 0 leaves it out.
-        creep_steps: see `creep`.
         start_from: a bundle whose weights and scales training starts from; null draws and measures them. Parameters
             that vary here, where none did there, become inputs (impulse networks).
         start_share: what is judged and saved is this share of the weights of `start_from` and the rest of the trained
@@ -55,8 +51,6 @@ class TrainingConfig:
     gradient_clip: float = MISSING
     loss_knee: float = MISSING
     balance: float = MISSING
-    creep: float = MISSING
-    creep_steps: int = MISSING
     start_from: str | None = None
     start_share: float = 0.0
     region_grains: int | None = None
@@ -76,13 +70,10 @@ class TrainingConfig:
             "gradient_clip",
             "loss_knee",
             "balance",
-            "creep",
         )
         for key in ("seed", *at_least_0):
             value = getattr(self, key)
             require(value >= 0, f"training.{key}", value, "at least 0", f"training.{key}=0 turns it off")
-        steps = self.creep_steps
-        require(steps > 1, "training.creep_steps", steps, "at least 2", "16 is what hopper_full learned with")
         most = self.noise_in_walls
         require(most <= 1, "training.noise_in_walls", most, "0 to 1", "it is a share of grains")
         share, known = self.start_share, self.start_from is not None
@@ -96,5 +87,4 @@ class TrainingConfig:
     @property
     def window_length(self) -> int:
         """Frames a training window needs: one before, the start, the model's own steps, the target."""
-        from gns_pyg.dynamics.integrator import BEFORE
-        return BEFORE - 1 + max(3 + self.unroll, 2 + self.creep_steps if self.creep else 0)
+        return 3 + self.unroll

@@ -1,7 +1,6 @@
 """What Lightning drives: one update of a simulator."""
 
 from collections.abc import Mapping, Sequence
-from dataclasses import replace
 from typing import Any, cast
 
 import numpy as np
@@ -15,20 +14,11 @@ from gns_pyg.dynamics.simulator import Simulator
 from gns_pyg.dynamics.tiles import ball
 from gns_pyg.errors import CheckpointError, ConfigError, NumericalError
 from gns_pyg.scene.symmetry import symmetry
-from gns_pyg.state import State, Window, constant
+from gns_pyg.state import State, Window
 from gns_pyg.training.augment import transform
 from gns_pyg.training.checkpoint import REMEDY
 from gns_pyg.training.config import TrainingConfig
-from gns_pyg.training.loss import (
-    CELLS,
-    CLASSES,
-    CREEP_CELLS,
-    balance_loss,
-    cells,
-    creep_loss,
-    mean_loss,
-    share_of_mean,
-)
+from gns_pyg.training.loss import CELLS, balance_loss, cells, mean_loss, share_of_mean
 from gns_pyg.training.noise import perturb
 
 MOST = 1e15  # of any number in a checkpoint beside its tensors
@@ -39,9 +29,9 @@ class TrainingModule(pl.LightningModule):
 
     The loss is the mean square of the scaled correction's error: for position-only states the paper's (12) up to a
     constant factor; or, with `loss_knee`, its mean length, which a few violent contacts do not rule. `balance` adds
-    what grains wrongly gain or lose together, `creep` what they do so in several steps. Noise and unrolling are drawn
-    from the seed, the update's number and the window's place in its batch, so a resumed run repeats none and skips
-    none, and several processes that share a batch compute what one would.
+    what grains wrongly gain or lose together. Noise and unrolling are drawn from the seed, the update's number and the
+    window's place in its batch, so a resumed run repeats none and skips none, and several processes that share a batch
+    compute what one would.
 
     Args:
         simulator: what is trained.
@@ -57,9 +47,6 @@ class TrainingModule(pl.LightningModule):
         if config.average_decay:
             self.average = AveragedModel(simulator, multi_avg_fn=get_ema_multi_avg_fn(config.average_decay))
             self.average.requires_grad_(False)
-        import copy, os
-        self.keep, self.a0, self.top = (float(os.environ.get(k, d)) for k, d in (("KEEP", 0), ("A0", 0.1), ("TOP", 5)))
-        self.__dict__["teacher"] = copy.deepcopy(simulator).requires_grad_(False).eval()
 
     @property
     def judged(self) -> Simulator:
@@ -146,8 +133,7 @@ class TrainingModule(pl.LightningModule):
         randoms = [self._random(self.global_rank * n_graphs + graph) for graph in range(n_graphs)]
         if self.simulator.requires.symmetry:
             window = transform(window, self.symmetry, randoms)
-        from gns_pyg.dynamics.integrator import BEFORE
-        state, frame = self.simulator.integrator.read(window, BEFORE), BEFORE
+        state, frame = self.simulator.integrator.read(window, 1), 1
         state, counted = perturb(state, self.config, self.simulator, randoms)
         with torch.no_grad():
             for _ in range(self._own_steps(self._random())):
@@ -159,26 +145,11 @@ class TrainingModule(pl.LightningModule):
             core, region = ball(state.pos, state.batch, self.config.region_grains, self.simulator.halo_m, randoms)
             counted = (counted & torch.zeros_like(counted).index_fill(0, core, True))[region]
             state, following = state.pick(region), following.pick(region)
-        answer = self.simulator.correction(state)
-        error = (answer - self.simulator.target(state, following))[counted]
+        error = (self.simulator.correction(state) - self.simulator.target(state, following))[counted]
         loss = mean_loss(error, self.config.loss_knee)
-        if self.keep:
-            with torch.no_grad():
-                known = self.teacher.correction(state)
-            s2 = state.vel.square().sum(1, keepdim=True)
-            fast = (s2 / (s2 + self.a0**2)).to(answer.dtype)
-            away = (fast * (answer - known))[counted]
-            term = self._imbalance(away, state, following, counted, randoms)
-            each = away.square().mean()
-            loss = loss + self.keep * (term + each)
-            if self.global_step % 10 == 0:
-                print("keep", self.global_step, float(term), float(each), float(loss), flush=True)
         if self.config.balance:
             loss = loss + self.config.balance * self._imbalance(error, state, following, counted, randoms)
         loss = loss * share_of_mean(len(error), error.device)
-        if self.config.creep:  # of the first window of all
-            share = share_of_mean(int(self.global_rank == 0), error.device)
-            loss = loss + (self.config.creep * share * self._creep(window, randoms[:1]) if share else 0.0)
         if not torch.isfinite(loss):
             raise NumericalError(
                 f"training update {self.global_step}",
@@ -202,39 +173,6 @@ class TrainingModule(pl.LightningModule):
             weight * balance_loss(error, vel, cells(pos, batch, edge * radius_m, randoms)) for edge, weight in CELLS
         ]
         return torch.stack(terms).sum()
-
-    def _creep(self, window: Window, randoms: Sequence[torch.Generator]) -> Tensor:
-        """`creep_loss` of the first window's grains after half of and all of `creep_steps` own steps."""
-        simulator, first = self.simulator, window.batch == 0
-        integrator, radius_m = simulator.integrator, max(simulator.scene.grains.radii_m)
-
-        def recorded(frame: int) -> State:
-            from gns_pyg.dynamics.integrator import BEFORE
-            state = integrator.read(window, frame + BEFORE - 1).pick(first)
-            parameters = None if state.parameters is None else state.parameters[:1]
-            return replace(state, time_s=state.time_s[:1], parameters=parameters)
-
-        state = recorded(1)
-        gained = integrator.without_contact(replace(state, vel=torch.zeros_like(state.vel))).vel
-        limits = constant(CLASSES, state.vel) * torch.linalg.vector_norm(gained, dim=1, keepdim=True)
-        kind = (torch.linalg.vector_norm(state.drift, dim=1, keepdim=True) >= limits).sum(1)
-        begun = state.pos
-        sizes = [(cells(state.pos, state.batch, edge * radius_m, randoms), weight) for edge, weight in CREEP_CELLS]
-        there, total = torch.ones_like(first[first]), state.vel.new_zeros(())
-        for step in range(1, self.config.creep_steps + 1):
-            state, following = simulator(state), recorded(1 + step)
-            if state.active is not None and following.active is not None:
-                there = there & state.active & following.active
-            if step in (self.config.creep_steps // 2, self.config.creep_steps):
-                scale = simulator.statistics.velocity_m_s * step * simulator.scene.frame_dt_s
-                vel = ((following.pos - begun) / scale).float()
-                error = ((state.pos - following.pos) / scale).float()
-                for cell, weight in sizes:
-                    if self.global_step % 10 == 0:
-                        print('creep', self.global_step, step, [(k, int((kind == k).sum()), round(float(creep_loss(error[there & (kind == k)], vel[there & (kind == k)], kind[there & (kind == k)], cell[there & (kind == k)])), 4)) for k in range(5)], flush=True)
-                    slow = there & (kind < self.top)
-                    total = total + weight * creep_loss(error[slow], vel[slow], kind[slow], cell[slow])
-        return total
 
     def _random(self, *window: int) -> torch.Generator:
         """A generator for this update, or for one window of its batch, whichever process computes it."""
