@@ -115,6 +115,7 @@ def side_by_side(state: State, copies: int) -> State:
         state,
         pos=(state.pos + places[:, None]).flatten(0, 1),
         vel=state.vel.repeat(copies, 1),
+        drift=None if state.drift is None else state.drift.repeat(copies, 1),
         ang_vel=None if state.ang_vel is None else state.ang_vel.repeat(copies, 1),
         radius=state.radius.repeat(copies),
         batch=state.batch.repeat(copies),

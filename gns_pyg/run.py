@@ -53,6 +53,7 @@ from gns_pyg.training.module import TrainingModule
 
 GROUPS = ["scene", "model", "requires", "data", "training", "trainer", "callbacks", "logger"]
 MATERIAL, ENCODER = "requires.material_features", "encode_grain.0.weight"
+MEMORY = ".from_drift."  # in the names of weights that look at it
 TRAIN_KEYS = ["name", "start_s", "compare_every_s", "ckpt_path", "device", "folder", *GROUPS]
 log = logging.getLogger(__name__)
 
@@ -91,13 +92,10 @@ def trained(cfg: DictConfig) -> tuple[Simulator, Split, Climatology, dict[str, A
     model = typed(ModelConfig, cfg.model, "model")
     data = typed(DataConfig, cfg.data, "data")
     forced = typed(Requires, cfg.requires, "requires")
-    require(
-        not (data.answers and training.unroll),
-        "training.unroll",
-        f"{training.unroll} with data.answers",
-        "0: answers are single frames, and tell what own steps would",
-        "set training.unroll=0",
-    )
+    several = {"training.unroll": training.unroll, "training.creep": training.creep, "model.memory": model.memory}
+    for key, value in several.items():
+        single = "0: answers are single frames, and tell what own steps would"
+        require(not (data.answers and value), key, f"{value} with data.answers", single, f"set {key}=0")
     cases, before = split(scene, data), bundle.card(training.start_from) if training.start_from else {}
     if before:
         unseen = [case for case in cases.test if not seen(case, scene, before)]
@@ -108,19 +106,19 @@ def trained(cfg: DictConfig) -> tuple[Simulator, Split, Climatology, dict[str, A
     log.info("what the scene requires (requires.<row> forces one):\n%s", requires)
     for case in (*cases.val, *cases.test):
         start_frame(case, cfg.start_s)
-    datamodule = DataModule(
-        cases,
-        length=training.window_length,
-        batch_size=training.batch_size,
-        seed=training.seed,
-        workers=data.workers,
-    )
     log.info(
         "%s: %d cases to train on, %d for validation, %d unseen; %d files of answers",
         scene.name,
         *(len(c) for c in vars(cases).values()),
     )
     simulator = build(scene, model, requires, cases, training)
+    datamodule = DataModule(
+        cases,
+        length=simulator.integrator.before() + training.window_length,
+        batch_size=training.batch_size,
+        seed=training.seed,
+        workers=data.workers,
+    )
     log.info("model: %d parameters", sum(p.numel() for p in simulator.parameters()))
     used = cases.describe()
     identity = flat({"model": asdict(model), "training": asdict(training), "cases": used})
@@ -265,8 +263,9 @@ def build(
     scene: Scene, config: ModelConfig, requires: Requirements, cases: Split, training: TrainingConfig
 ) -> Simulator:
     """A simulator for a scene: its scales measured on the training cases and its weights drawn from the seed, or both
-    taken from the bundle `training.start_from`. If parameters vary here and none did there, impulse networks gain them
-    as inputs of weight zero: it predicts what the bundle does until it is trained.
+    taken from the bundle `training.start_from`. If parameters vary here and none did there, or grains have a memory
+    here alone, impulse networks gain them as inputs of weight zero: it predicts what the bundle does until it is
+    trained.
 
     Raises:
         BundleError: if that bundle cannot be read.
@@ -283,7 +282,8 @@ def build(
         differ = [key for key in sorted({*here, *there}) if here.get(key) != there.get(key)]
         can_gain = start.config.network == "impulse" and not start.requires.material_features
         gained = requires.material_features if can_gain else []
-        keys = [key for key in differ if not key.startswith(elsewhere) and not (gained and key == MATERIAL)]
+        more = {MATERIAL: gained, "model.memory": config.memory and not start.config.memory}
+        keys = [key for key in differ if not key.startswith(elsewhere) and not more.get(key)]
         require(
             not keys,
             "training.start_from",
@@ -306,6 +306,11 @@ def build(
         if gained:
             networks[ENCODER] = nn.functional.pad(networks[ENCODER], (0, len(gained)))  # its last inputs
         simulator.load_state_dict(networks, strict=False)
+        if training.start_fixed:
+            remedy = "set model.memory, or training.start_fixed=false"
+            require(config.memory > 0, "training.start_fixed", "true, and nothing else to train", "a memory", remedy)
+            for name, weights in simulator.named_parameters():
+                weights.requires_grad_(MEMORY in name)
     return simulator
 
 

@@ -74,6 +74,8 @@ class State(Record):
         batch: graph of each grain, sorted.
         parameters: what may vary from case to case, in the order of `scene.PARAMETERS`, SI; None where nothing does.
         active: whether a grain is in the scene, or None where grains neither leave nor enter.
+        drift: mean velocity over the last frames, m/s, float64 (see `dynamics.memory`), or None where the model's state
+            does not hold it.
     """
 
     pos: Float[Tensor, "n_grains 3"]
@@ -84,6 +86,7 @@ class State(Record):
     batch: Int[Tensor, " n_grains"]
     parameters: Float[Tensor, "n_graphs n_parameters"] | None = None
     active: Bool[Tensor, " n_grains"] | None = None
+    drift: Float[Tensor, "n_grains 3"] | None = None
 
     @property
     def n_graphs(self) -> int:
@@ -99,6 +102,7 @@ class State(Record):
             radius=self.radius[grains],
             batch=self.batch[grains],
             active=None if self.active is None else self.active[grains],
+            drift=None if self.drift is None else self.drift[grains],
         )
 
 
@@ -190,6 +194,8 @@ class Contacts:
         basis: the contact's directions, columns; first the unit normal, from the receiver to the other side.
         slow: dimensionless velocity below which the networks need a finer scale.
         wall_vel: dimensionless velocity of the boundary point; None between grains and where walls stand.
+        drift: how both sides move against each other over the last frames, where the model's state holds that: along
+            every direction and at all, (n_contacts, 2 (b + 1)), dimensionless and on a finer scale.
         share: how much more than its partner sender and receiver are moved by the same impulse: 2 m' / (m + m') with m'
             the partner's mass; None where all masses are equal.
     """
@@ -199,4 +205,5 @@ class Contacts:
     basis: Float[Tensor, "e 3 b"]
     slow: float
     wall_vel: Float[Tensor, "e 3"] | None = None
+    drift: Float[Tensor, "e d"] | None = None
     share: Float[Tensor, "e 2"] | None = None

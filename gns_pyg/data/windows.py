@@ -51,7 +51,7 @@ class Windows(Dataset):
                     trajectory.path,
                     f"{trajectory.n_frames} frames",
                     f"at least {length}, the length of one training window",
-                    "use longer cases or lower training.unroll",
+                    "use longer cases or lower training.unroll and training.creep_steps",
                 )
         self.starts = np.cumsum([0] + [t.n_frames - length + 1 for t in self.trajectories])
 

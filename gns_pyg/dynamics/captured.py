@@ -50,7 +50,7 @@ class Captured:
             self.capacities, self._graph = grown, None
 
     def _replay(self, state: State) -> tuple[State, Tensor]:
-        if self._graph is None or self._input.pos.shape != state.pos.shape or self._input.n_graphs != state.n_graphs:
+        if self._graph is None or _shapes(self._input) != _shapes(state):
             self._capture(state)
         for name in _tensors(state):
             getattr(self._input, name).copy_(getattr(state, name))
@@ -148,6 +148,10 @@ class Captured:
 
 def _tensors(state: State) -> list[str]:
     return [field.name for field in fields(state) if getattr(state, field.name) is not None]
+
+
+def _shapes(state: State) -> dict[str, torch.Size]:
+    return {name: getattr(state, name).shape for name in _tensors(state)}
 
 
 def _one_graph(pos: Float[Tensor, "n 3"]) -> Int[Tensor, " n"]:

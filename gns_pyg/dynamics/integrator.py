@@ -5,6 +5,7 @@ mean velocity over the step (m/s), then, if the state holds them, end velocity (
 Without `free_flight` the first group is the mean velocity itself, as in the paper.
 """
 
+import math
 from dataclasses import replace
 
 import torch
@@ -12,6 +13,7 @@ from jaxtyping import Float
 from torch import Tensor
 
 from gns_pyg.config import require
+from gns_pyg.dynamics import memory as mean_motion
 from gns_pyg.scene.free_flight import free_flight
 from gns_pyg.scene.scene import PARAMETERS, STATES, Scene
 from gns_pyg.state import State, Window
@@ -25,16 +27,26 @@ class Integrator:
         state: what a state holds. `differences`: position and (x(t) - x(t - dt)) / dt, as in the paper; `velocity`:
             position and instantaneous velocity; `full`: angular velocity too.
         free_flight: corrections are taken relative to free flight; else relative to standing still.
+        memory: frames over which the mean motion of a grain is a part of the state; 0: it is not.
     """
 
-    def __init__(self, scene: Scene, state: str, *, free_flight: bool) -> None:
+    def __init__(self, scene: Scene, state: str, *, free_flight: bool, memory: int = 0) -> None:
         require(state in STATES, "requires.state", state, " or ".join(STATES), "pick one of them")
-        self.scene, self.state, self.free_flight = scene, state, free_flight
+        self.scene, self.state, self.free_flight, self.memory = scene, state, free_flight, memory
         self.dt_s = scene.frame_dt_s
         self.n_groups = 1 + STATES.index(state)
 
-    def read(self, window: Window, frame: int) -> State:
-        """The state at `frame` of a window; `differences` also reads the frame before."""
+    def before(self, steps: int = 1) -> int:
+        """Recorded frames, each `steps` steps after the last, that a state is read from beside its own."""
+        return max(1, math.ceil(mean_motion.FRAMES * self.memory / steps))
+
+    def read(self, window: Window, frame: int, steps: int = 1) -> State:
+        """The state at `frame` of a window, whose frames are `steps` steps apart; `differences` also reads the frame
+        before, `memory` as many as there are of those that `before` says."""
+        drift = None
+        if self.memory:
+            way = window.pos[max(0, frame - self.before(steps)) : frame + 1]
+            drift = mean_motion.recorded(way, max(1.0, self.memory / steps), steps * self.dt_s)
         if self.state == "differences":
             vel = (window.pos[frame] - window.pos[frame - 1]) / self.dt_s
         else:
@@ -44,10 +56,11 @@ class Integrator:
             vel=vel,
             ang_vel=window.ang_vel[frame] if self.state == "full" else None,
             radius=window.radius,
-            time_s=window.time_s + frame * self.dt_s,
+            time_s=window.time_s + frame * steps * self.dt_s,
             batch=window.batch,
             parameters=window.parameters,
             active=None if window.active is None else window.active[frame],
+            drift=drift,
         )
 
     def without_contact(self, state: State) -> State:
@@ -60,6 +73,11 @@ class Integrator:
         if self.state == "differences":  # the mean velocity of one frame passes into that of the next
             pos = state.pos + vel * self.dt_s
         return replace(state, pos=pos, vel=vel, time_s=later)
+
+    def gained(self, state: State) -> Float[Tensor, " n_grains"]:
+        """Speed of each grain after a frame of free flight from rest, m/s."""
+        still = torch.zeros_like(state.vel)
+        return torch.linalg.vector_norm(self.without_contact(replace(state, vel=still)).vel, dim=1)
 
     def damping(self, state: State) -> Float[Tensor, " n_grains"]:
         """Of each grain: its case's own where cases vary, else the scene's."""

@@ -19,6 +19,8 @@ class ModelConfig:
             (`models.contact_network`, the paper's); `impulse` has every contact exchange impulses, equal and opposite
             (`models.impulse_network`).
         channels: vectors that a grain carries between the rounds of an impulse network.
+        memory: frames over which the mean motion of a grain is a part of the state (see `dynamics.memory`; impulse
+            networks, scenes whose walls all stand); 0: the state is of one instant.
         absolute_position: give networks the absolute position (the paper; breaks translation invariance).
         contact_features: gap, approach and slip on edges, beside the geometry of Mayr et al.
         self_loops: an edge from every grain to itself, so that one without neighbours is computed too (the paper).
@@ -32,6 +34,7 @@ class ModelConfig:
 
     network: str = "message"
     channels: int = 6
+    memory: int = 0
     absolute_position: bool = MISSING
     contact_features: bool = MISSING
     self_loops: bool = MISSING
@@ -54,6 +57,10 @@ class ModelConfig:
             for key, needed in needs.items():
                 value, expected = getattr(self, key), f"{needed} with model.network=impulse"
                 require(value == needed, f"model.{key}", value, expected.lower(), "see conf/model/impulse.yaml")
-        for key, least in (("channels", 3), ("hidden", 1), ("layers", 1), ("mlp_layers", 2), ("projection_sweeps", 0)):
+        else:
+            known = "0 with model.network=message"
+            require(not self.memory, "model.memory", self.memory, known, "set model.network=impulse")
+        lowest = {"channels": 3, "memory": 0, "hidden": 1, "layers": 1, "mlp_layers": 2, "projection_sweeps": 0}
+        for key, least in lowest.items():
             value = getattr(self, key)
             require(value >= least, f"model.{key}", value, f"at least {least}", f"set model.{key} to {least} or more")

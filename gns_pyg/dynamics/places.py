@@ -82,6 +82,7 @@ def elsewhere(
             pos=state.pos * length + shift_m,
             vel=state.vel * speed,
             ang_vel=None if state.ang_vel is None else state.ang_vel / time,
+            drift=None if state.drift is None else state.drift * speed,
             radius=state.radius * length,
             time_s=state.time_s * time,
         )

@@ -15,9 +15,12 @@ from torch import Tensor
 from gns_pyg.state import State
 
 REST = 0.15  # of the way that the speed of a step of free flight from rest would carry a grain
+REST_AFTER_CREEP = 0.03  # the same for models that know a grain's mean motion: others do not creep, they tremble on
 
 
-def rested(before: State, after: State, gained_m_s: Float[Tensor, " n_grains"], dt_s: float) -> State:
+def rested(
+    before: State, after: State, gained_m_s: Float[Tensor, " n_grains"], dt_s: float, share: float = REST
+) -> State:
     """`after`, with every grain at rest that hardly moved.
 
     What a network says of positions and velocities is not quite consistent: a grain may stay in its place for ever and
@@ -27,8 +30,9 @@ def rested(before: State, after: State, gained_m_s: Float[Tensor, " n_grains"], 
         before, after: the step.
         gained_m_s: speed of each grain after a step of free flight from rest.
         dt_s: the step.
+        share: of that way; who goes less, stands.
     """
-    stands = torch.linalg.vector_norm(after.pos - before.pos, dim=1) < REST * gained_m_s * dt_s
+    stands = torch.linalg.vector_norm(after.pos - before.pos, dim=1) < share * gained_m_s * dt_s
     for state in (before, after):
         stands &= torch.linalg.vector_norm(state.vel, dim=1) < gained_m_s / 2
     rows = stands[:, None]

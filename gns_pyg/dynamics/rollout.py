@@ -50,7 +50,7 @@ def rollout(
 
 def check_finite(state: State, step: int) -> None:
     """Raises NumericalError if a value is not finite; names step, field and grain."""
-    for field in ("pos", "vel", "ang_vel", "radius"):
+    for field in ("pos", "vel", "ang_vel", "drift", "radius"):
         values = getattr(state, field)
         if values is not None and not torch.isfinite(values).all():
             grain = int((~torch.isfinite(values)).nonzero()[0, 0])
@@ -65,7 +65,7 @@ def check_finite(state: State, step: int) -> None:
 
 
 def _same(before: State, after: State) -> bool:
-    fields = ("pos", "vel", "ang_vel", "active")
+    fields = ("pos", "vel", "ang_vel", "drift", "active")
     pairs = [(getattr(before, field), getattr(after, field)) for field in fields]
     return all(one is two or torch.equal(one, two) for one, two in pairs)
 

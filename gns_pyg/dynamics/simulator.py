@@ -10,6 +10,7 @@ from jaxtyping import Bool, Float, Int
 from torch import Tensor, nn
 
 from gns_pyg.config import require
+from gns_pyg.dynamics import memory
 from gns_pyg.dynamics.boundary import Boundary
 from gns_pyg.dynamics.execution import Execution
 from gns_pyg.dynamics.free_grains import MARGIN_RADII, among, can_meet, can_touch, meeting, pair_margin_m
@@ -18,7 +19,7 @@ from gns_pyg.dynamics.integrator import Integrator
 from gns_pyg.dynamics.model_config import ModelConfig
 from gns_pyg.dynamics.passage import Passage
 from gns_pyg.dynamics.projection import separated
-from gns_pyg.dynamics.rest import rested
+from gns_pyg.dynamics.rest import REST, REST_AFTER_CREEP, rested
 from gns_pyg.dynamics.tiles import tiles
 from gns_pyg.graph import contacts, features
 from gns_pyg.graph.neighbors import backend, pairs
@@ -58,7 +59,8 @@ class Simulator(nn.Module):
     ) -> None:
         super().__init__()
         self.scene, self.config, self.requires, self.statistics = scene, config, requires, statistics
-        self.integrator = Integrator(scene, requires.state, free_flight=requires.free_flight)
+        options: dict[str, Any] = dict(free_flight=requires.free_flight, memory=config.memory)
+        self.integrator = Integrator(scene, requires.state, **options)
         scale = torch.tensor(statistics.correction).repeat_interleave(3)
         self.register_buffer("scale", scale, persistent=False)
         self.execution = Execution()
@@ -107,7 +109,10 @@ class Simulator(nn.Module):
         require(
             requires.free_flight, "requires.free_flight", "false with model.network=impulse", known, "set it to auto"
         )
+        moving = config.memory and any(part.motion.moves for part in self.scene.boundary.values())
+        require(not moving, "model.memory", config.memory, "0 in a scene whose walls move", "set model.memory=0")
         width = {key: getattr(config, key) for key in ("hidden", "layers", "mlp_layers", "channels")}
+        width["memory"] = bool(config.memory)
         n_grain = 2 + requires.radius_features + len(self._conditions)
         self.encode_grain = mlp(n_grain, config.hidden, config.hidden, config.mlp_layers, layer_norm=True)
         n_scalar, n_basis = contacts.N_SCALARS, contacts.N_BASIS
@@ -128,17 +133,23 @@ class Simulator(nn.Module):
         if self.config.projection_sweeps:
             after = self._separated(state, after)
         if self.requires.rest:
-            still = torch.zeros_like(state.vel)
-            gained = self.integrator.without_contact(replace(state, vel=still)).vel
-            after = rested(state, after, torch.linalg.vector_norm(gained, dim=1), self.scene.frame_dt_s)
+            after = rested(state, after, self.integrator.gained(state), self.scene.frame_dt_s, self._rest)
         return after if self.passage is None else self.passage(state, after)
 
     def guarded(self, before: State, after: State) -> State:
-        """`after`, without what went through a wall (see `guard`)."""
+        """`after`, without what went through a wall (see `guard`), and with what grains remember."""
         held = self.guard(before, after)
         if self.requires.state == "differences" and held is not after:
             held = replace(held, vel=(held.pos - before.pos) / self.scene.frame_dt_s)
+        if steps := self.config.memory:
+            still_m_s = self._rest * self.integrator.gained(before)
+            held = memory.remembered(before, held, steps, self.scene.frame_dt_s, still_m_s)
         return held
+
+    @property
+    def _rest(self) -> float:
+        """See `dynamics.rest`."""
+        return REST_AFTER_CREEP if self.config.memory else REST
 
     def _separated(self, state: State, after: State) -> State:
         there = after if after.active is None else replace(after.pick(after.active), active=None)
@@ -205,7 +216,10 @@ class Simulator(nn.Module):
         velocity_m_s, dtype, dt_s = self.statistics.velocity_m_s, self.scale.dtype, self.scene.frame_dt_s
         free_vel = state.vel + constant(self.scene.gravity_m_s2, state.vel) * dt_s
         options: dict[str, Any] = dict(velocity_m_s=velocity_m_s, dt_s=dt_s, dtype=dtype)
-        options["slow"] = slow = contacts.FINE * self.scene.grains.radii_m[0] / dt_s / velocity_m_s
+        slow_m_s = contacts.FINE * self.scene.grains.radii_m[0] / dt_s
+        options["slow"] = slow = slow_m_s / velocity_m_s
+        if self.config.memory:
+            options["drift"] = memory.of_slow(state, slow_m_s)
         grains = self._grains(state, free_vel)
         unlike = len(self.scene.grains.radii_m) > 1
         assert isinstance(self.grain_network, ImpulseNetwork)

@@ -66,7 +66,7 @@ def steps_per_frame(simulator: Simulator, trajectory: Trajectory) -> int:
 
 def initial_state(simulator: Simulator, trajectory: Trajectory, frame: int) -> State:
     """The recorded state at `frame`."""
-    return _recorded(simulator, trajectory, range(frame - 1, frame), 2)[0]
+    return _recorded(simulator, trajectory, range(frame, frame + 1))[0]
 
 
 def perturbed(state: State, copies: int, shift_m: float, seed: int) -> State:
@@ -93,11 +93,14 @@ def perturbed(state: State, copies: int, shift_m: float, seed: int) -> State:
     return replace(state, **repeated)
 
 
-def _recorded(simulator: Simulator, trajectory: Trajectory, frames: range, length: int) -> tuple[State, Window]:
-    """The recorded states one frame after `frames`, batched, and the windows of `length` frames that begin there."""
-    window = Window.collate([read_window(trajectory, frame, length) for frame in frames])
-    times_s = torch.from_numpy(trajectory.times_s[frames.start + 1 : frames.stop + 1])
-    return replace(simulator.integrator.read(window, 1), time_s=times_s), window
+def _recorded(simulator: Simulator, trajectory: Trajectory, frames: range, after: int = 0) -> tuple[State, Window]:
+    """The recorded states at `frames`, all at least 1, batched, and windows of the frames that they are read from and
+    `after` more."""
+    steps = steps_per_frame(simulator, trajectory)
+    before = min(simulator.integrator.before(steps), frames.start)
+    window = Window.collate([read_window(trajectory, frame - before, before + 1 + after) for frame in frames])
+    times_s = torch.from_numpy(trajectory.times_s[frames.start : frames.stop])
+    return replace(simulator.integrator.read(window, before, steps), time_s=times_s), window
 
 
 def write_rollout(simulator: Simulator, trajectory: Trajectory, start: int, path: Path) -> float:
@@ -221,14 +224,14 @@ def one_step_errors(simulator: Simulator, trajectory: Trajectory, batch_size: in
     """Mean position error (the paper's (13)), m, one frame after every recorded state: of frames 2 to the last, over
     the grains present in the frame and the two before it (see `trivial_errors`)."""
     errors, steps = [], steps_per_frame(simulator, trajectory)
-    for first in range(0, trajectory.n_frames - 2, batch_size):
-        frames = range(first, min(first + batch_size, trajectory.n_frames - 2))
-        state, window = _recorded(simulator, trajectory, frames, 3)
-        state, truth = state.to(simulator.scale.device), window.pos[2]
+    for first in range(1, trajectory.n_frames - 1, batch_size):
+        frames = range(first, min(first + batch_size, trajectory.n_frames - 1))
+        state, window = _recorded(simulator, trajectory, frames, after=1)
+        state, truth = state.to(simulator.scale.device), window.pos[-1]
         for _ in range(steps):
             state = simulator(state)
         if window.active is not None:
-            truth = torch.where(window.active.all(dim=0)[:, None], truth, torch.nan)
+            truth = torch.where(window.active[-3:].all(dim=0)[:, None], truth, torch.nan)
         shape = (len(frames), trajectory.n_grains, 3)
         errors.append(position_error(state.pos.cpu().numpy().reshape(shape), truth.numpy().reshape(shape)))
     return np.concatenate(errors)

@@ -262,7 +262,7 @@ def extremes(bench: Bench) -> Verdict:
 def bad_values(bench: Bench) -> Verdict:
     """NaN and infinity in every field, at the start and in the middle of a roll-out."""
     simulator, told = bench.simulator, []
-    fields = [name for name in ("pos", "vel", "ang_vel", "radius") if getattr(bench.middle, name) is not None]
+    fields = [name for name in ("pos", "vel", "ang_vel", "drift", "radius") if getattr(bench.middle, name) is not None]
     for name in fields:
         for value in (math.nan, math.inf):
             values = getattr(bench.middle, name).clone()

@@ -13,6 +13,7 @@ from gns_pyg.state import Contacts, Graph, State, Walls, fine
 
 N_SCALARS, N_WALL_SCALARS = 11, 13
 N_BASIS, N_WALL_BASIS = 2, 3
+SOFT = 1e-6  # under the root of a squared length, so that its gradient stays finite
 FINE = 1e-3  # of a radius: an overlap that bears a few grains; slip that is slower than this in a frame is slow
 
 
@@ -26,6 +27,7 @@ def grain_contacts(
     velocity_m_s: float,
     dt_s: float,
     dtype: torch.dtype,
+    drift: Float[Tensor, "n 3"] | None = None,
 ) -> Contacts:
     """Pairs of grains. Directions: the line of centres, the slip.
 
@@ -37,6 +39,7 @@ def grain_contacts(
         slow: see `Contacts`.
         velocity_m_s, dt_s: the data's velocity scale and the frame.
         dtype: the networks'.
+        drift: mean velocity of grains over the last frames, m/s, where the model looks at it.
     """
     sender, receiver = graph.grain_edges
     rel_pos, rel_vel = (between(x, sender, receiver) for x in (state.pos, free_vel))
@@ -49,8 +52,10 @@ def grain_contacts(
     if unlike:
         mass = torch.stack([state.radius[receiver], state.radius[sender]], dim=1) ** 3
         share = (2 * mass / mass.sum(1, keepdim=True)).to(dtype)
-    basis = torch.stack([normal, sideways], dim=2)
-    return Contacts(graph.grain_edges, scalars.to(dtype), basis.to(dtype), slow, share=share)
+    basis, drifts = torch.stack([normal, sideways], dim=2), None
+    if drift is not None:
+        drifts = _drifts(between(drift, sender, receiver) / velocity_m_s, basis, slow).to(dtype)
+    return Contacts(graph.grain_edges, scalars.to(dtype), basis.to(dtype), slow, drift=drifts, share=share)
 
 
 def wall_contacts(
@@ -65,6 +70,7 @@ def wall_contacts(
     velocity_m_s: float,
     dt_s: float,
     dtype: torch.dtype,
+    drift: Float[Tensor, "n 3"] | None = None,
 ) -> Contacts:
     """Boundary points and grains; the gap is that to the point's tangent plane. Directions: against the wall's normal,
     the slip, towards the point.
@@ -87,8 +93,17 @@ def wall_contacts(
     if friction:
         columns.append(walls.friction_angle[point][:, None])
     basis, own_vel = torch.stack([normal, sideways, towards], dim=2), (wall_vel / velocity_m_s).to(dtype)
-    scalars = torch.cat(columns, dim=1).to(dtype)
-    return Contacts(graph.wall_edges, scalars, basis.to(dtype), slow, own_vel if moving else None)
+    scalars, drifts = torch.cat(columns, dim=1).to(dtype), None
+    if drift is not None:
+        drifts = _drifts(-drift.index_select(0, grain) / velocity_m_s, basis, slow).to(dtype)  # walls stand
+    return Contacts(graph.wall_edges, scalars, basis.to(dtype), slow, own_vel if moving else None, drifts)
+
+
+def _drifts(drift: Float[Tensor, "e 3"], basis: Float[Tensor, "e 3 b"], slow: float) -> Float[Tensor, "e f"]:
+    """As of `Contacts`; all 0 where nothing drifts."""
+    speed = (drift.square().sum(1, keepdim=True) + SOFT).sqrt() - SOFT**0.5
+    seen = torch.cat([torch.einsum("ei,eib->eb", drift, basis), speed], dim=1)
+    return torch.cat([seen, fine(seen, slow)], dim=1)
 
 
 def _scalars(

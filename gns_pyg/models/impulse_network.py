@@ -48,7 +48,7 @@ class Piece:
     contacts as its last dimension: the same component of all of them lies together in memory.
 
     Attributes:
-        scalars, slow, wall_vel: as of `Contacts`.
+        scalars, slow, wall_vel, drift: as of `Contacts`.
         ends: their grains: receiver, between grains then sender.
         stacked: the same where what receivers show is followed by what senders do.
         basis: the contacts' directions; first the normal.
@@ -62,6 +62,7 @@ class Piece:
     basis: Float[Tensor, "3 b e"]
     slow: float
     wall_vel: Float[Tensor, "e 3"] | None
+    drift: Float[Tensor, "e d"] | None
     told: tuple[Int[Tensor, " m"], ...]
     share: tuple[Float[Tensor, "m 1"], ...] | None
 
@@ -75,16 +76,26 @@ class ImpulseNetwork(nn.Module):
         mutual: both sides are grains; else one is a wall, which nothing moves.
         hidden, layers, mlp_layers: width, rounds, linear layers of each MLP.
         channels: vectors that a grain carries, at least three.
+        memory: rounds look at the contacts' drift too.
     """
 
     def __init__(
-        self, *, n_scalar: int, n_basis: int, mutual: bool, hidden: int, layers: int, mlp_layers: int, channels: int
+        self,
+        *,
+        n_scalar: int,
+        n_basis: int,
+        mutual: bool,
+        hidden: int,
+        layers: int,
+        mlp_layers: int,
+        channels: int,
+        memory: bool = False,
     ) -> None:
         super().__init__()
         self.hidden, self.mutual = hidden, mutual
         self.encode = mlp(n_scalar, hidden, hidden, mlp_layers, layer_norm=True)
         self.rounds = nn.ModuleList(
-            ImpulseRound(hidden, mlp_layers, channels, n_basis, mutual=mutual, last=turn == layers - 1)
+            ImpulseRound(hidden, mlp_layers, channels, n_basis, mutual=mutual, last=turn == layers - 1, memory=memory)
             for turn in range(layers)
         )
 
@@ -118,11 +129,13 @@ class ImpulseRound(MessagePassing):
     """One round: every contact exchanges messages and impulses, then the grains' latents follow.
 
     Args:
-        hidden, mlp_layers, channels, n_basis, mutual: see `ImpulseNetwork`.
+        hidden, mlp_layers, channels, n_basis, mutual, memory: see `ImpulseNetwork`.
         last: no later round would read the grains' latents.
     """
 
-    def __init__(self, hidden: int, mlp_layers: int, channels: int, n_basis: int, *, mutual: bool, last: bool) -> None:
+    def __init__(
+        self, hidden: int, mlp_layers: int, channels: int, n_basis: int, *, mutual: bool, last: bool, memory: bool
+    ) -> None:
         super().__init__(aggr="sum", flow="source_to_target")
         self.hidden, self.channels, self.mutual = hidden, channels, mutual
         n_given = channels * (n_basis + 1)
@@ -131,6 +144,10 @@ class ImpulseRound(MessagePassing):
         self.from_edge = nn.Linear(hidden, hidden, bias=False)
         for part in (self.from_seen, self.from_ends, self.from_edge):
             nn.init.uniform_(part.weight, -((3 * hidden) ** -0.5), (3 * hidden) ** -0.5)  # as one layer of 3 x hidden
+        self.from_drift: nn.Linear | None = None
+        if memory:
+            self.from_drift = nn.Linear(2 * (n_basis + 1), hidden, bias=False)
+            nn.init.zeros_(self.from_drift.weight)  # begin without
         self.message_mlp = mlp(hidden, hidden, hidden, mlp_layers - 1, layer_norm=True)
         self.impulse_mlp = mlp(hidden, hidden, n_given, 2)
         with torch.no_grad():  # begin near free flight
@@ -178,7 +195,10 @@ class ImpulseRound(MessagePassing):
         speed = (slip.square().sum(0) + SOFT).sqrt()
         seen = torch.cat([along, speed])
         seen = torch.cat([seen, fine(seen, contacts.slow)]).t().contiguous()
-        message = self.message_mlp((hidden + linear(self.from_edge, edge) + linear(self.from_seen, seen)).relu_())
+        known = hidden + linear(self.from_edge, edge) + linear(self.from_seen, seen)
+        if self.from_drift is not None and contacts.drift is not None:
+            known = known + linear(self.from_drift, contacts.drift)
+        message = self.message_mlp(known.relu_())
         edge = edge + message
         factors = self.impulse_mlp(edge).t().contiguous().view(basis.shape[1] + 1, self.channels, len(edge))
         against = factors[-1] / (1 + (speed / FASTEST).square()).sqrt()
@@ -221,9 +241,11 @@ def pieces(contacts: Contacts, hidden: int, n: int, *, mutual: bool) -> list[Pie
     sides = contacts.ends.flip(0)[: 1 + mutual]
     always = [blocks(side, hidden) for side in (sides.T, contacts.scalars, contacts.basis)]
     none = [None] * len(always[0])
-    perhaps = [none if side is None else blocks(side, hidden) for side in (contacts.wall_vel, contacts.share)]
+    perhaps = [
+        none if side is None else blocks(side, hidden) for side in (contacts.wall_vel, contacts.drift, contacts.share)
+    ]
     found = []
-    for ends, scalars, basis, wall_vel, share in zip(*always, *perhaps, strict=True):
+    for ends, scalars, basis, wall_vel, drift, share in zip(*always, *perhaps, strict=True):
         more = recurring(ends, ROWS, hidden)
         found.append(
             Piece(
@@ -233,6 +255,7 @@ def pieces(contacts: Contacts, hidden: int, n: int, *, mutual: bool) -> list[Pie
                 basis=recurring(basis, ROWS, hidden).permute(1, 2, 0).contiguous(),
                 slow=contacts.slow,
                 wall_vel=None if wall_vel is None else recurring(wall_vel, ROWS, hidden),
+                drift=None if drift is None else recurring(drift, ROWS, hidden),
                 told=ends.unbind(1),
                 share=None if share is None else share.flip(1).split(1, dim=1),
             )

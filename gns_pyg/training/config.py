@@ -31,8 +31,13 @@ class TrainingConfig:
         balance: weight of the momentum and the energy that cells of some 30 and 300 grains wrongly gain or lose
             together. (Each grain's own error is smallest for an average motion, which loses speed at every step.) 0
             leaves it out.
+        creep: weight of the way that cells of slow grains, about as fast as each other, wrongly go, over their own, in
+            `creep_steps` of the model's own steps and in half of them, from one whole frame of every update; gradients
+            run through all these steps, each of which takes the time and memory of an update. 0 leaves it out.
+        creep_steps: see `creep`.
         start_from: a bundle whose weights and scales training starts from; null draws and measures them. Parameters
-            that vary here, where none did there, become inputs (impulse networks).
+            that vary here, where none did there, and a memory (`model.memory`) become inputs (impulse networks).
+        start_fixed: weights of `start_from` stay as they are, but for those that look at a grain's memory.
         start_share: what is judged and saved is this share of the weights of `start_from` and the rest of the trained
             ones (Wortsman et al. 2022, "Robust fine-tuning of zero-shot models"); 0 is the trained ones.
         average_decay: the weights' exponential moving average with this decay is what is judged and saved; 0 is none.
@@ -51,7 +56,10 @@ class TrainingConfig:
     gradient_clip: float = MISSING
     loss_knee: float = MISSING
     balance: float = MISSING
+    creep: float = MISSING
+    creep_steps: int = MISSING
     start_from: str | None = None
+    start_fixed: bool = False
     start_share: float = 0.0
     region_grains: int | None = None
     average_decay: float = MISSING
@@ -70,15 +78,20 @@ class TrainingConfig:
             "gradient_clip",
             "loss_knee",
             "balance",
+            "creep",
         )
         for key in ("seed", *at_least_0):
             value = getattr(self, key)
             require(value >= 0, f"training.{key}", value, "at least 0", f"training.{key}=0 turns it off")
+        steps = self.creep_steps
+        require(steps > 1, "training.creep_steps", steps, "at least 2", "16 is what hopper_full learned with")
         most = self.noise_in_walls
         require(most <= 1, "training.noise_in_walls", most, "0 to 1", "it is a share of grains")
         share, known = self.start_share, self.start_from is not None
         require(0 <= share < 1, "training.start_share", share, "0 up to below 1", "e.g. 0.5")
         require(not share or known, "training.start_share", share, "0 without training.start_from", "name a bundle")
+        fixed = self.start_fixed
+        require(not fixed or known, "training.start_fixed", fixed, "false without training.start_from", "name a bundle")
         region = self.region_grains
         require(region is None or region > 0, "training.region_grains", region, "at least 1", "null takes all grains")
         decay = self.average_decay
@@ -86,5 +99,5 @@ class TrainingConfig:
 
     @property
     def window_length(self) -> int:
-        """Frames a training window needs: one before, the start, the model's own steps, the target."""
-        return 3 + self.unroll
+        """Frames a training window needs beside those before: the start, the model's own steps, the target."""
+        return max(2 + self.unroll, 1 + self.creep_steps if self.creep else 0)

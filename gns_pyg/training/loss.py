@@ -5,6 +5,10 @@ less than what it is an average of: |E v|^2 <= E |v|^2 (Jensen). A step by step 
 result, and the better-known part of the error does not show it. So cells of grains, small against the flow and large
 against a collision (coarse graining: Goldhirsch 2010), must also keep, on average, the DEM's momentum and energy;
 larger ones too, whose means scatter less: in small cells an error that a whole bed shares drowns.
+
+A heap creeps with a thousandth of the flow's energy, and what a step lacks of that shows after many only, as each
+begins where the last one ended. So cells of slow grains must also, over their own speed, have moved as far as the DEM's
+after several steps.
 """
 
 from collections.abc import Sequence
@@ -14,6 +18,9 @@ from jaxtyping import Float, Int
 from torch import Tensor
 from torch import distributed as dist
 
+FEWEST, SLOWEST = 100, 0.01  # grains of a class, and speed over the velocity scale, below which an error is but chance
+CLASSES = (0.2, 0.6, 2.0, 6.0)  # upper limits of classes of mean speed, over what a grain gains in free flight's frame
+CREEP_CELLS = ((8.0, 1.0), (17.6, 3.0), (35.0, 60.0))  # as CELLS
 CELLS = ((8.0, 1.0), (17.6, 10.0))  # edge in radii, weight: 30 and 300 grains of a dense bed; scatter weighs alike
 
 
@@ -40,6 +47,31 @@ def balance_loss(error: Float[Tensor, "n 3"], vel: Float[Tensor, "n 3"], cell: I
     count = torch.bincount(cell)
     total = rows.new_zeros(len(count), 4).index_add_(0, cell, rows)
     return (total.square().sum(1) / count).sum() / max(len(rows), 1)
+
+
+def creep_loss(
+    error: Float[Tensor, "n 3"], vel: Float[Tensor, "n 3"], kind: Int[Tensor, " n"], cell: Int[Tensor, " n"]
+) -> Float[Tensor, ""]:
+    """How far from where the DEM's are cells have gone on average, for each class of grains by itself and over its own
+    mean square way: the slower counts as much as the faster; summed over classes.
+
+    Args:
+        error: of mean velocities, over a scale of velocity.
+        vel: the DEM's, over the same scale.
+        kind: class of each grain; classes of fewer than FEWEST are left out.
+        cell: of each grain, as of `cells`.
+    """
+    total = error.new_zeros(())
+    for known in kind.unique():
+        own = kind == known
+        n = int(own.sum())
+        if n >= FEWEST:
+            number = torch.unique(cell[own], return_inverse=True)[1]
+            count = torch.bincount(number)
+            gained = error.new_zeros(len(count), 3).index_add(0, number, error[own])
+            square = vel[own].square().sum() / n + SLOWEST**2
+            total = total + (gained.square().sum(1) / count).sum() / n / square
+    return total
 
 
 def cells(

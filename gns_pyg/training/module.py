@@ -1,6 +1,7 @@
 """What Lightning drives: one update of a simulator."""
 
 from collections.abc import Mapping, Sequence
+from dataclasses import replace
 from typing import Any, cast
 
 import numpy as np
@@ -10,15 +11,25 @@ from pytorch_lightning.utilities.types import OptimizerLRScheduler
 from torch import Tensor
 from torch.optim.swa_utils import AveragedModel, get_ema_multi_avg_fn
 
+from gns_pyg.dynamics.memory import known
 from gns_pyg.dynamics.simulator import Simulator
 from gns_pyg.dynamics.tiles import ball
 from gns_pyg.errors import CheckpointError, ConfigError, NumericalError
 from gns_pyg.scene.symmetry import symmetry
-from gns_pyg.state import State, Window
+from gns_pyg.state import State, Window, constant
 from gns_pyg.training.augment import transform
 from gns_pyg.training.checkpoint import REMEDY
 from gns_pyg.training.config import TrainingConfig
-from gns_pyg.training.loss import CELLS, balance_loss, cells, mean_loss, share_of_mean
+from gns_pyg.training.loss import (
+    CELLS,
+    CLASSES,
+    CREEP_CELLS,
+    balance_loss,
+    cells,
+    creep_loss,
+    mean_loss,
+    share_of_mean,
+)
 from gns_pyg.training.noise import perturb
 
 MOST = 1e15  # of any number in a checkpoint beside its tensors
@@ -29,9 +40,9 @@ class TrainingModule(pl.LightningModule):
 
     The loss is the mean square of the scaled correction's error: for position-only states the paper's (12) up to a
     constant factor; or, with `loss_knee`, its mean length, which a few violent contacts do not rule. `balance` adds
-    what grains wrongly gain or lose together. Noise and unrolling are drawn from the seed, the update's number and the
-    window's place in its batch, so a resumed run repeats none and skips none, and several processes that share a batch
-    compute what one would.
+    what grains wrongly gain or lose together, `creep` how far slow ones wrongly go together in several steps. Noise and
+    unrolling are drawn from the seed, the update's number and the window's place in its batch, so a resumed run repeats
+    none and skips none, and several processes that share a batch compute what one would.
 
     Args:
         simulator: what is trained.
@@ -133,7 +144,8 @@ class TrainingModule(pl.LightningModule):
         randoms = [self._random(self.global_rank * n_graphs + graph) for graph in range(n_graphs)]
         if self.simulator.requires.symmetry:
             window = transform(window, self.symmetry, randoms)
-        state, frame = self.simulator.integrator.read(window, 1), 1
+        frame = self.simulator.integrator.before()
+        state = self.simulator.integrator.read(window, frame)
         state, counted = perturb(state, self.config, self.simulator, randoms)
         with torch.no_grad():
             for _ in range(self._own_steps(self._random())):
@@ -150,6 +162,9 @@ class TrainingModule(pl.LightningModule):
         if self.config.balance:
             loss = loss + self.config.balance * self._imbalance(error, state, following, counted, randoms)
         loss = loss * share_of_mean(len(error), error.device)
+        if self.config.creep:  # of the first window of all
+            share = share_of_mean(int(self.global_rank == 0), error.device)
+            loss = loss + (self.config.creep * share * self._creep(window, randoms[:1]) if share else 0.0)
         if not torch.isfinite(loss):
             raise NumericalError(
                 f"training update {self.global_step}",
@@ -173,6 +188,32 @@ class TrainingModule(pl.LightningModule):
             weight * balance_loss(error, vel, cells(pos, batch, edge * radius_m, randoms)) for edge, weight in CELLS
         ]
         return torch.stack(terms).sum()
+
+    def _creep(self, window: Window, randoms: Sequence[torch.Generator]) -> Tensor:
+        """`creep_loss` of the first window's grains after half of and all of `creep_steps` own steps."""
+        simulator, first = self.simulator, window.batch == 0
+        integrator, radius_m = simulator.integrator, max(simulator.scene.grains.radii_m)
+
+        def recorded(step: int) -> State:
+            state = integrator.read(window, integrator.before() + step).pick(first)
+            parameters = None if state.parameters is None else state.parameters[:1]
+            return replace(state, time_s=state.time_s[:1], parameters=parameters)
+
+        state = start = recorded(0)
+        limits = constant(CLASSES, state.vel) * integrator.gained(state)[:, None]
+        kind = (torch.linalg.vector_norm(known(state), dim=1, keepdim=True) >= limits).sum(1)
+        sizes = [(cells(state.pos, state.batch, edge * radius_m, randoms), weight) for edge, weight in CREEP_CELLS]
+        there, total = kind < len(CLASSES), state.vel.new_zeros(())
+        for step in range(1, self.config.creep_steps + 1):
+            state, following = simulator(state), recorded(step)
+            if state.active is not None and following.active is not None:
+                there = there & state.active & following.active
+            if step in (self.config.creep_steps // 2, self.config.creep_steps):
+                scale = simulator.statistics.velocity_m_s * step * integrator.dt_s
+                vel, error = (following.pos - start.pos) / scale, (state.pos - following.pos) / scale
+                for cell, weight in sizes:
+                    total = total + weight * creep_loss(error[there], vel[there], kind[there], cell[there])
+        return total
 
     def _random(self, *window: int) -> torch.Generator:
         """A generator for this update, or for one window of its batch, whichever process computes it."""

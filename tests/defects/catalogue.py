@@ -192,8 +192,8 @@ DEFECTS = [
     Defect(
         "noise left on in evaluation",
         "gns_pyg/evaluation/predict.py",
-        "return replace(simulator.integrator.read(window, 1), time_s=times_s), window",
-        "return perturbed(replace(simulator.integrator.read(window, 1), time_s=times_s), 1, 1e-5, 0), window",
+        "replace(simulator.integrator.read(window, before, steps), time_s=times_s), window",
+        "perturbed(replace(simulator.integrator.read(window, before, steps), time_s=times_s), 1, 1e-5, 0), window",
         ("tests/evaluation/test_absence.py::test_an_untrained_model_is_exact_where_nothing_touches",),
     ),
     Defect(
@@ -282,6 +282,20 @@ DEFECTS = [
         "gained + told * sign if side",
         "gained + torch.cat([told[:, :heard], -told[:, heard:]], dim=1) if side",
         ("tests/models/test_impulse_network.py::test_a_tangential_impulse_turns_both_grains_alike",),
+    ),
+    Defect(
+        "only the last frame is remembered",
+        "gns_pyg/dynamics/memory.py",
+        "drift + (moved - drift) / memory",
+        "moved",
+        ("tests/dynamics/test_memory.py::test_what_is_read_is_what_steps_would_have_remembered",),
+    ),
+    Defect(
+        "fast grains look at their memory too",
+        "gns_pyg/dynamics/memory.py",
+        "return share.square() * drift",
+        "return drift",
+        ("tests/dynamics/test_memory.py::test_fast_grains_go_as_without_a_memory_and_slow_ones_do_not",),
     ),
     Defect(
         "graphs of a batch see each other's walls",

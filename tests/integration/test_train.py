@@ -127,6 +127,38 @@ def test_a_share_of_the_old_weights_stays(trained, tmp_path):
         train(tmp_path / "none", "experiment=hopper", "training.start_share=0.5")
 
 
+def test_creep_is_part_of_the_loss_and_asks_for_frames(tmp_path):
+    overrides = ["experiment=hopper", "training.updates=2", "training.unroll=0", "data.test_fraction=0"]
+    train(tmp_path / "one", *overrides)
+    train(tmp_path / "two", *overrides, "training.creep=1", "training.creep_steps=3")
+    one, two = weights(tmp_path / "one"), weights(tmp_path / "two")
+    assert any(not torch.equal(one[key], two[key]) for key in one)
+    with pytest.raises(DataError, match="creep_steps"):
+        train(tmp_path / "long", *overrides, "training.creep=1", "training.creep_steps=500")
+    with pytest.raises(ConfigError, match=r"training\.creep"):
+        train(tmp_path / "answers", *overrides, "training.creep=1", "data.answers=[somewhere]")
+
+
+def test_a_memory_is_learned_beside_what_stays(trained, tmp_path):
+    start = f"training.start_from={trained[0] / 'bundle'}"
+    recall = ["experiment=hopper", "training.updates=3", start, "model.memory=2", "data.test_fraction=0"]
+    recall += ["training.unroll=0", "training.creep=1", "training.creep_steps=2", "training.average_decay=0"]
+    train(tmp_path / "fixed", *recall, "training.start_fixed=true")
+    train(tmp_path / "all", *recall)
+    old, fixed, new = (weights(folder) for folder in (trained[0], tmp_path / "fixed", tmp_path / "all"))
+    assert all(torch.equal(fixed[key], old[key]) for key in old)
+    assert any(not torch.equal(new[key], old[key]) for key in old)
+    gained = fixed.keys() - old.keys()
+    assert gained
+    assert all(".from_drift." in key and fixed[key].any() for key in gained)
+    with pytest.raises(ConfigError, match=r"training\.start_fixed"):
+        train(tmp_path / "none", "experiment=hopper", start, "training.start_fixed=true")
+    with pytest.raises(ConfigError, match=r"training\.start_fixed"):
+        train(tmp_path / "new", "experiment=hopper", "training.start_fixed=true")
+    with pytest.raises(ConfigError, match=r"model\.memory"):
+        train(tmp_path / "answers", *recall, "training.creep=0", "data.answers=[somewhere]")
+
+
 def test_bundle_equals_checkpoint(trained):
     """The bundle holds the averaged weights of the last checkpoint."""
     checkpoint = torch.load(trained[0] / "checkpoints" / "last.ckpt", weights_only=True)["state_dict"]

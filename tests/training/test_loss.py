@@ -3,7 +3,7 @@
 import pytest
 import torch
 
-from gns_pyg.training.loss import balance_loss, cells, mean_loss
+from gns_pyg.training.loss import FEWEST, SLOWEST, balance_loss, cells, creep_loss, mean_loss
 
 
 def test_the_loss_is_a_square_below_the_knee_and_a_length_above():
@@ -31,6 +31,20 @@ def test_balance_is_the_square_of_what_a_cell_gains_together():
     assert loss.item() == 0
     assert not torch.autograd.grad(loss, still)[0].any()
     assert balance_loss(error[:0], vel[:0], cell[:0]).item() == 0
+
+
+def test_what_creeps_counts_as_much_as_what_flows():
+    """Two classes, each a tenth too fast along x in one cell and along -x in the other; a third of too few grains."""
+    kind = torch.tensor([0] * FEWEST + [1] * FEWEST + [2] * (FEWEST - 1))
+    cell = torch.arange(len(kind)) % 2
+    vel = torch.zeros(len(kind), 3, dtype=torch.float64)
+    vel[:, 2] = torch.tensor([0.1, 10.0, 1.0], dtype=torch.float64)[kind]
+    error = torch.zeros_like(vel)
+    error[:, 0] = 0.1 * vel[:, 2] * (1 - 2 * cell)
+    expected = 0.01 * 0.1**2 / (0.1**2 + SLOWEST**2) + 0.01 * 10**2 / (10**2 + SLOWEST**2)
+    assert creep_loss(error, vel, kind, cell).item() == pytest.approx(expected)
+    assert creep_loss(error, vel, kind, 0 * cell).item() == pytest.approx(0, abs=1e-12), "nothing is gained together"
+    assert creep_loss(error[:0], vel[:0], kind[:0], cell[:0]).item() == 0
 
 
 def test_ten_times_larger_cells_scatter_a_tenth_and_see_all_of_an_error_that_grains_share():

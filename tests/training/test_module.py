@@ -8,6 +8,7 @@ import torch
 from gns_pyg.data.trajectory import Trajectory
 from gns_pyg.data.windows import Windows
 from gns_pyg.state import Window
+from gns_pyg.training import loss as training_loss
 from gns_pyg.training import module as training_module
 from gns_pyg.training.config import TrainingConfig
 from gns_pyg.training.module import TrainingModule
@@ -29,6 +30,8 @@ CONFIG = dict(
     gradient_clip=0.0,
     loss_knee=0.0,
     balance=0.0,
+    creep=0.0,
+    creep_steps=4,
     average_decay=0.9,
 )
 
@@ -98,17 +101,16 @@ def test_unrolling_begins_when_told_and_takes_every_length(monkeypatch):
 
 @pytest.mark.parametrize("state", ["differences", "velocity", "full"])
 @pytest.mark.parametrize("own_steps", [0, 2])
-@pytest.mark.parametrize("balance", [0.0, 10.0])
-def test_free_flight_leaves_nothing_to_learn(state, own_steps, balance, tmp_path, monkeypatch):
+@pytest.mark.parametrize("weights", [{}, {"balance": 10.0}, {"creep": 1.0}], ids=["error", "balance", "creep"])
+def test_free_flight_leaves_nothing_to_learn(state, own_steps, weights, tmp_path, monkeypatch):
     """Every step of every window, recorded or the model's own, is compared with the frame that it leads to."""
     scene = scenes.free_flight_case(tmp_path / "case.h5", n_frames=9, damping=0.2, rising=False)
     model = simulator(scene, state=state, dtype=torch.float64)
-    training = TrainingModule(
-        model, TrainingConfig(**CONFIG | {"noise_radii": 0.0, "noise_velocity": 0.0, "balance": balance})
-    )
+    monkeypatch.setattr(training_loss, "FEWEST", 1)
+    training = TrainingModule(model, TrainingConfig(**CONFIG | {"noise_radii": 0.0, "noise_velocity": 0.0} | weights))
     monkeypatch.setattr(training, "_own_steps", lambda random: own_steps)
     monkeypatch.setattr(training, "log", lambda *_, **__: None)
-    windows = Windows([Trajectory(tmp_path / "case.h5")], training.config.window_length)
+    windows = Windows([Trajectory(tmp_path / "case.h5")], 1 + training.config.window_length)
     batch = Window.collate([windows[0], windows[len(windows) - 1]])
     assert training.training_step(batch, 0).item() < 1e-8  # 0.1 um and 10 um/s of rounding in the file; a frame is 1
 
@@ -136,5 +138,5 @@ def test_noise_is_seen_in_the_loss(tmp_path, monkeypatch):
     scene = scenes.free_flight_case(tmp_path / "case.h5", n_frames=9)
     training = TrainingModule(simulator(scene, dtype=torch.float64), TrainingConfig(**CONFIG))
     monkeypatch.setattr(training, "log", lambda *_, **__: None)
-    window = Windows([Trajectory(tmp_path / "case.h5")], training.config.window_length)[0]
+    window = Windows([Trajectory(tmp_path / "case.h5")], 1 + training.config.window_length)[0]
     assert training.training_step(window, 0).item() > 1e-3
