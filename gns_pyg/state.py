@@ -13,6 +13,7 @@ from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
 AnyRecord = TypeVar("AnyRecord", bound="Record")
+SOFT = 1e-6  # under the root of a squared length, so that its gradient stays finite
 
 
 def constant(values: Sequence[float | int], like: Tensor) -> Tensor:

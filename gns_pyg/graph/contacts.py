@@ -9,11 +9,10 @@ from jaxtyping import Float
 from torch import Tensor
 
 from gns_pyg.graph.features import between, closeness, dot, polar, surface_slip
-from gns_pyg.state import Contacts, Graph, State, Walls, fine
+from gns_pyg.state import SOFT, Contacts, Graph, State, Walls, fine
 
 N_SCALARS, N_WALL_SCALARS = 11, 13
 N_BASIS, N_WALL_BASIS = 2, 3
-SOFT = 1e-6  # under the root of a squared length, so that its gradient stays finite
 FINE = 1e-3  # of a radius: an overlap that bears a few grains; slip that is slower than this in a frame is slow
 
 

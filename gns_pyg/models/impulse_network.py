@@ -19,12 +19,11 @@ from torch.nn.functional import embedding_bag
 from torch_geometric.nn import MessagePassing
 
 from gns_pyg.models.mlp import ROWS, blocks, linear, mlp, only, recurring
-from gns_pyg.state import Contacts, fine, reached
+from gns_pyg.state import SOFT, Contacts, fine, reached
 
 VELOCITY, MEAN, GAINED = 0, 1, 2  # channels: end velocity, mean velocity's correction, what gravity adds in a frame
 SPHERE = 2.5  # m r^2 / I: what a tangential impulse turns it
 FASTEST = 30.0  # of the velocity scale: what answers a slip in proportion stays below; nothing grows without end
-SOFT = 1e-6  # under the root of a squared length, so that its gradient stays finite
 
 
 @dataclass(frozen=True)

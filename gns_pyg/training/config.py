@@ -84,7 +84,7 @@ class TrainingConfig:
             value = getattr(self, key)
             require(value >= 0, f"training.{key}", value, "at least 0", f"training.{key}=0 turns it off")
         steps = self.creep_steps
-        require(steps > 1, "training.creep_steps", steps, "at least 2", "16 is what hopper_full learned with")
+        require(steps > 1, "training.creep_steps", steps, "at least 2", "16 is the default")
         most = self.noise_in_walls
         require(most <= 1, "training.noise_in_walls", most, "0 to 1", "it is a share of grains")
         share, known = self.start_share, self.start_from is not None
