@@ -92,7 +92,8 @@ def trained(cfg: DictConfig) -> tuple[Simulator, Split, Climatology, dict[str, A
     model = typed(ModelConfig, cfg.model, "model")
     data = typed(DataConfig, cfg.data, "data")
     forced = typed(Requires, cfg.requires, "requires")
-    several = {"training.unroll": training.unroll, "training.creep": training.creep, "model.memory": model.memory}
+    several = {f"training.{key}": getattr(training, key) for key in ("unroll", "creep", "gaps")}
+    several["model.memory"] = model.memory
     for key, value in several.items():
         single = "0: answers are single frames, and tell what own steps would"
         require(not (data.answers and value), key, f"{value} with data.answers", single, f"set {key}=0")

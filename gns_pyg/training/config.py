@@ -35,6 +35,8 @@ class TrainingConfig:
             `creep_steps` of the model's own steps and in half of them, from one whole frame of every update; gradients
             run through all these steps, each of which takes the time and memory of an update. 0 leaves it out.
         creep_steps: see `creep`.
+        gaps: weight of how far the gaps between these slow grains, where they touch or nearly do, are then from the
+            DEM's. 0 leaves it out: a bed may creep as far as it should with its contacts open.
         start_from: a bundle whose weights and scales training starts from; null draws and measures them. Parameters
             that vary here, where none did there, and a memory (`model.memory`) become inputs (impulse networks).
         start_fixed: weights of `start_from` stay as they are, but for those that look at a grain's memory.
@@ -58,6 +60,7 @@ class TrainingConfig:
     balance: float = MISSING
     creep: float = MISSING
     creep_steps: int = MISSING
+    gaps: float = MISSING
     start_from: str | None = None
     start_fixed: bool = False
     start_share: float = 0.0
@@ -79,6 +82,7 @@ class TrainingConfig:
             "loss_knee",
             "balance",
             "creep",
+            "gaps",
         )
         for key in ("seed", *at_least_0):
             value = getattr(self, key)
@@ -100,4 +104,4 @@ class TrainingConfig:
     @property
     def window_length(self) -> int:
         """Frames a training window needs beside those before: the start, the model's own steps, the target."""
-        return max(2 + self.unroll, 1 + self.creep_steps if self.creep else 0)
+        return max(2 + self.unroll, 1 + self.creep_steps if self.creep or self.gaps else 0)

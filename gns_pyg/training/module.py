@@ -15,6 +15,8 @@ from gns_pyg.dynamics.memory import known
 from gns_pyg.dynamics.simulator import Simulator
 from gns_pyg.dynamics.tiles import ball
 from gns_pyg.errors import CheckpointError, ConfigError, NumericalError
+from gns_pyg.graph.contacts import FINE
+from gns_pyg.graph.neighbors import backend
 from gns_pyg.scene.symmetry import symmetry
 from gns_pyg.state import State, Window, constant
 from gns_pyg.training.augment import transform
@@ -24,9 +26,11 @@ from gns_pyg.training.loss import (
     CELLS,
     CLASSES,
     CREEP_CELLS,
+    NEAR,
     balance_loss,
     cells,
     creep_loss,
+    gap_loss,
     mean_loss,
     share_of_mean,
 )
@@ -40,9 +44,10 @@ class TrainingModule(pl.LightningModule):
 
     The loss is the mean square of the scaled correction's error: for position-only states the paper's (12) up to a
     constant factor; or, with `loss_knee`, its mean length, which a few violent contacts do not rule. `balance` adds
-    what grains wrongly gain or lose together, `creep` how far slow ones wrongly go together in several steps. Noise and
-    unrolling are drawn from the seed, the update's number and the window's place in its batch, so a resumed run repeats
-    none and skips none, and several processes that share a batch compute what one would.
+    what grains wrongly gain or lose together; `creep` and `gaps` add how far slow ones wrongly go together in several
+    steps, and from each other. Noise and unrolling are drawn from the seed, the update's number and the window's place
+    in its batch, so a resumed run repeats none and skips none, and several processes that share a batch compute what
+    one would.
 
     Args:
         simulator: what is trained.
@@ -162,9 +167,9 @@ class TrainingModule(pl.LightningModule):
         if self.config.balance:
             loss = loss + self.config.balance * self._imbalance(error, state, following, counted, randoms)
         loss = loss * share_of_mean(len(error), error.device)
-        if self.config.creep:  # of the first window of all
+        if self.config.creep or self.config.gaps:  # of the first window of all
             share = share_of_mean(int(self.global_rank == 0), error.device)
-            loss = loss + (self.config.creep * share * self._creep(window, randoms[:1]) if share else 0.0)
+            loss = loss + (share * self._ahead(window, randoms[:1]) if share else 0.0)
         if not torch.isfinite(loss):
             raise NumericalError(
                 f"training update {self.global_step}",
@@ -189,9 +194,10 @@ class TrainingModule(pl.LightningModule):
         ]
         return torch.stack(terms).sum()
 
-    def _creep(self, window: Window, randoms: Sequence[torch.Generator]) -> Tensor:
-        """`creep_loss` of the first window's grains after half of and all of `creep_steps` own steps."""
-        simulator, first = self.simulator, window.batch == 0
+    def _ahead(self, window: Window, randoms: Sequence[torch.Generator]) -> Tensor:
+        """`creep_loss` and `gap_loss`, weighted, of the first window's slow grains after half of and all of
+        `creep_steps` own steps."""
+        simulator, config, first = self.simulator, self.config, window.batch == 0
         integrator, radius_m = simulator.integrator, max(simulator.scene.grains.radii_m)
 
         def recorded(step: int) -> State:
@@ -203,16 +209,27 @@ class TrainingModule(pl.LightningModule):
         limits = constant(CLASSES, state.vel) * integrator.gained(state)[:, None]
         kind = (torch.linalg.vector_norm(known(state), dim=1, keepdim=True) >= limits).sum(1)
         sizes = [(cells(state.pos, state.batch, edge * radius_m, randoms), weight) for edge, weight in CREEP_CELLS]
+        search = backend(simulator.config.neighbors, state.pos.device).build(state.pos, state.batch)
+        one, other = search(state.pos, state.batch, (2 + NEAR) * radius_m)
+        near = (one < other) & (apart(state, one, other) < state.radius[one] + state.radius[other] + NEAR * radius_m)
+        one, other = one[near], other[near]
         there, total = kind < len(CLASSES), state.vel.new_zeros(())
-        for step in range(1, self.config.creep_steps + 1):
+        for step in range(1, config.creep_steps + 1):
             state, following = simulator(state), recorded(step)
             if state.active is not None and following.active is not None:
                 there = there & state.active & following.active
-            if step in (self.config.creep_steps // 2, self.config.creep_steps):
+            if step in (config.creep_steps // 2, config.creep_steps):
                 scale = simulator.statistics.velocity_m_s * step * integrator.dt_s
                 vel, error = (following.pos - start.pos) / scale, (state.pos - following.pos) / scale
                 for cell, weight in sizes:
-                    total = total + weight * creep_loss(error[there], vel[there], kind[there], cell[there])
+                    found = creep_loss(error[there], vel[there], kind[there], cell[there])
+                    total = total + config.creep * weight * found
+                both = there[one] & there[other]
+                before, ours, theirs = (
+                    apart(x, one[both], other[both]) / (FINE * radius_m) for x in (start, state, following)
+                )
+                faster = torch.maximum(kind[one], kind[other])[both]
+                total = total + config.gaps * gap_loss(ours - theirs, theirs - before, faster)
         return total
 
     def _random(self, *window: int) -> torch.Generator:
@@ -234,6 +251,11 @@ class TrainingModule(pl.LightningModule):
             optimizer, lambda update: 0.5 ** min(int(update / stretch), self.config.halvings)
         )
         return {"optimizer": optimizer, "lr_scheduler": {"scheduler": schedule, "interval": "step"}}
+
+
+def apart(state: State, one: Tensor, other: Tensor) -> Tensor:
+    """Distances between the centres of grains, m."""
+    return torch.linalg.vector_norm(state.pos[one] - state.pos[other], dim=1)
 
 
 def unlike(found: Any, expected: Any, where: str) -> tuple[str, str] | None:

@@ -298,6 +298,20 @@ DEFECTS = [
         ("tests/dynamics/test_memory.py::test_fast_grains_go_as_without_a_memory_and_slow_ones_do_not",),
     ),
     Defect(
+        "gaps should stay as they were",
+        "gns_pyg/training/module.py",
+        "gap_loss(ours - theirs,",
+        "gap_loss(ours - before,",
+        ("tests/training/test_module.py::test_free_flight_leaves_nothing_to_learn",),
+    ),
+    Defect(
+        "gaps count whatever they would be had they stayed",
+        "gns_pyg/training/loss.py",
+        "wrong / (stayed + BARE * n)",
+        "wrong / n",
+        ("tests/training/test_loss.py::test_gaps_count_over_how_far_they_would_be_had_they_stayed",),
+    ),
+    Defect(
         "graphs of a batch see each other's walls",
         BOUNDARY,
         "row = state.batch[grain] * len(part.pos) + point",

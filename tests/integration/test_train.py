@@ -131,12 +131,15 @@ def test_creep_is_part_of_the_loss_and_asks_for_frames(tmp_path):
     overrides = ["experiment=hopper", "training.updates=2", "training.unroll=0", "data.test_fraction=0"]
     train(tmp_path / "one", *overrides)
     train(tmp_path / "two", *overrides, "training.creep=1", "training.creep_steps=3")
-    one, two = weights(tmp_path / "one"), weights(tmp_path / "two")
+    train(tmp_path / "gaps", *overrides, "training.creep=1", "training.creep_steps=3", "training.gaps=1")
+    one, two, gaps = (weights(tmp_path / name) for name in ("one", "two", "gaps"))
     assert any(not torch.equal(one[key], two[key]) for key in one)
+    assert any(not torch.equal(two[key], gaps[key]) for key in two)
     with pytest.raises(DataError, match="creep_steps"):
         train(tmp_path / "long", *overrides, "training.creep=1", "training.creep_steps=500")
-    with pytest.raises(ConfigError, match=r"training\.creep"):
-        train(tmp_path / "answers", *overrides, "training.creep=1", "data.answers=[somewhere]")
+    for key in ("creep", "gaps"):
+        with pytest.raises(ConfigError, match=rf"training\.{key}"):
+            train(tmp_path / "answers", *overrides, f"training.{key}=1", "data.answers=[somewhere]")
 
 
 def test_a_memory_is_learned_beside_what_stays(trained, tmp_path):

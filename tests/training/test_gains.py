@@ -23,7 +23,7 @@ TRAINING = dict(updates=1, batch_size=1, seed=0, lr_start=1e-3, halvings=0, nois
 TRAINING |= dict(
     noise_in_walls=0.0, unroll=0, unroll_from=0.0, gradient_clip=0.0, loss_knee=0.0, balance=0.0, creep=0.0
 )
-TRAINING |= dict(creep_steps=2, average_decay=0.0)
+TRAINING |= dict(creep_steps=2, gaps=0.0, average_decay=0.0)
 
 
 def cases(folder: Path) -> tuple[Scene, list[Trajectory]]:

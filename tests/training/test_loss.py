@@ -3,7 +3,7 @@
 import pytest
 import torch
 
-from gns_pyg.training.loss import FEWEST, SLOWEST, balance_loss, cells, creep_loss, mean_loss
+from gns_pyg.training.loss import BARE, FEWEST, SLOWEST, balance_loss, cells, creep_loss, gap_loss, mean_loss
 
 
 def test_the_loss_is_a_square_below_the_knee_and_a_length_above():
@@ -45,6 +45,16 @@ def test_what_creeps_counts_as_much_as_what_flows():
     assert creep_loss(error, vel, kind, cell).item() == pytest.approx(expected)
     assert creep_loss(error, vel, kind, 0 * cell).item() == pytest.approx(0, abs=1e-12), "nothing is gained together"
     assert creep_loss(error[:0], vel[:0], kind[:0], cell[:0]).item() == 0
+
+
+def test_gaps_count_over_how_far_they_would_be_had_they_stayed():
+    """Two classes, both half as far off as the DEM's gaps have moved, one by a thousandth; a third of too few pairs."""
+    kind = torch.tensor([0] * FEWEST + [1] * FEWEST + [2] * (FEWEST - 1))
+    way = torch.tensor([1e3, 1e-3, 1.0], dtype=torch.float64)[kind] * (1 - 2 * (torch.arange(len(kind)) % 2))
+    large, small = (1e3 / 2 - 1) / (1e3 - 1 + BARE), (1e-6 / 8) / (1e-6 / 2 + BARE)
+    assert gap_loss(way / 2, way, kind).item() == pytest.approx(large + small, rel=1e-5)
+    assert gap_loss(0 * way, way, kind).item() == 0
+    assert gap_loss(way[:0], way[:0], kind[:0]).item() == 0
 
 
 def test_ten_times_larger_cells_scatter_a_tenth_and_see_all_of_an_error_that_grains_share():
