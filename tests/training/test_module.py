@@ -116,9 +116,7 @@ def test_free_flight_leaves_nothing_to_learn(state, own_steps, term, tmp_path, m
     monkeypatch.setattr(training, "log", lambda *_, **__: None)
     windows = Windows([Trajectory(tmp_path / "case.h5")], 1 + training.config.window_length)
     batch = Window.collate([windows[0], windows[len(windows) - 1]])
-    most = (
-        1e-5 if term == "gaps" else 1e-8
-    )  # 0.1 um and 10 um/s of rounding in the file, on finer scales or coarse ones
+    most = 1e-5 if term == "gaps" else 1e-8  # 0.1 um and 10 um/s of rounding in the file; a frame is 1
     assert training.training_step(batch, 0).item() < most
 
 
