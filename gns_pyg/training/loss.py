@@ -12,10 +12,10 @@ after several steps. Their contacts overlap by micrometres, which an error on th
 may creep as it should and not touch, unless its gaps must stay the DEM's.
 """
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 
 import torch
-from jaxtyping import Float, Int
+from jaxtyping import Bool, Float, Int
 from torch import Tensor
 from torch import distributed as dist
 
@@ -32,7 +32,7 @@ def mean_loss(error: Float[Tensor, "n d"], knee: float) -> Float[Tensor, ""]:
     if not knee:
         return error.square().sum() / max(error.numel(), 1)
     squares = error.view(len(error), error.shape[1] // 3, 3).square().sum(2)
-    return ((squares + knee**2).sqrt() - knee).sum() / max(squares.numel(), 1)
+    return _pseudo_huber(squares, knee).sum() / max(squares.numel(), 1)
 
 
 def balance_loss(error: Float[Tensor, "n 3"], vel: Float[Tensor, "n 3"], cell: Int[Tensor, " n"]) -> Float[Tensor, ""]:
@@ -64,15 +64,12 @@ def creep_loss(
         cell: of each grain, as of `cells`.
     """
     total = error.new_zeros(())
-    for known in kind.unique():
-        own = kind == known
-        n = int(own.sum())
-        if n >= FEWEST:
-            number = torch.unique(cell[own], return_inverse=True)[1]
-            count = torch.bincount(number)
-            gained = error.new_zeros(len(count), 3).index_add(0, number, error[own])
-            square = vel[own].square().sum() / n + SLOWEST**2
-            total = total + (gained.square().sum(1) / count).sum() / n / square
+    for own, n in _classes(kind):
+        number = torch.unique(cell[own], return_inverse=True)[1]
+        count = torch.bincount(number)
+        gained = error.new_zeros(len(count), 3).index_add(0, number, error[own])
+        square = vel[own].square().sum() / n + SLOWEST**2
+        total = total + (gained.square().sum(1) / count).sum() / n / square
     return total
 
 
@@ -86,13 +83,23 @@ def gap_loss(error: Float[Tensor, " p"], way: Float[Tensor, " p"], kind: Int[Ten
         kind: class of each pair; classes of fewer than FEWEST are left out.
     """
     total = error.new_zeros(())
+    for own, n in _classes(kind):
+        wrong, stayed = (_pseudo_huber(x[own].square(), 1.0).sum() for x in (error, way))
+        total = total + wrong / (stayed + BARE * n)
+    return total
+
+
+def _classes(kind: Int[Tensor, " n"]) -> Iterator[tuple[Bool[Tensor, " n"], int]]:
+    """Who is of each class, and how many they are; classes of fewer than FEWEST are left out."""
     for known in kind.unique():
         own = kind == known
         n = int(own.sum())
         if n >= FEWEST:
-            wrong, stayed = (((x[own].square() + 1).sqrt() - 1).sum() for x in (error, way))
-            total = total + wrong / (stayed + BARE * n)
-    return total
+            yield own, n
+
+
+def _pseudo_huber(squares: Tensor, knee: float) -> Tensor:
+    return (squares + knee**2).sqrt() - knee
 
 
 def cells(

@@ -16,6 +16,7 @@ from gns_pyg.dynamics.simulator import Simulator
 from gns_pyg.dynamics.tiles import ball
 from gns_pyg.errors import CheckpointError, ConfigError, NumericalError
 from gns_pyg.graph.contacts import FINE
+from gns_pyg.graph.features import between
 from gns_pyg.graph.neighbors import backend
 from gns_pyg.scene.symmetry import symmetry
 from gns_pyg.state import State, Window, constant
@@ -211,7 +212,8 @@ class TrainingModule(pl.LightningModule):
         sizes = [(cells(state.pos, state.batch, edge * radius_m, randoms), weight) for edge, weight in CREEP_CELLS]
         search = backend(simulator.config.neighbors, state.pos.device).build(state.pos, state.batch)
         one, other = search(state.pos, state.batch, (2 + NEAR) * radius_m)
-        near = (one < other) & (apart(state, one, other) < state.radius[one] + state.radius[other] + NEAR * radius_m)
+        touch = state.radius[one] + state.radius[other]
+        near = (one < other) & (distances(state, one, other) < touch + NEAR * radius_m)
         one, other = one[near], other[near]
         there, total = kind < len(CLASSES), state.vel.new_zeros(())
         for step in range(1, config.creep_steps + 1):
@@ -226,7 +228,7 @@ class TrainingModule(pl.LightningModule):
                     total = total + config.creep * weight * found
                 both = there[one] & there[other]
                 before, ours, theirs = (
-                    apart(x, one[both], other[both]) / (FINE * radius_m) for x in (start, state, following)
+                    distances(x, one[both], other[both]) / (FINE * radius_m) for x in (start, state, following)
                 )
                 faster = torch.maximum(kind[one], kind[other])[both]
                 total = total + config.gaps * gap_loss(ours - theirs, theirs - before, faster)
@@ -253,9 +255,9 @@ class TrainingModule(pl.LightningModule):
         return {"optimizer": optimizer, "lr_scheduler": {"scheduler": schedule, "interval": "step"}}
 
 
-def apart(state: State, one: Tensor, other: Tensor) -> Tensor:
+def distances(state: State, one: Tensor, other: Tensor) -> Tensor:
     """Distances between the centres of grains, m."""
-    return torch.linalg.vector_norm(state.pos[one] - state.pos[other], dim=1)
+    return torch.linalg.vector_norm(between(state.pos, one, other), dim=1)
 
 
 def unlike(found: Any, expected: Any, where: str) -> tuple[str, str] | None:
