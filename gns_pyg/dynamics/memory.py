@@ -1,7 +1,7 @@
 """A grain's mean motion as a part of the state.
 
 Grains of a heap that creeps tremble: contacts swing within a frame, and the velocity of an instant hardly shows where a
-slow grain goes (docs/balance.md, "What carries a slide"). The exponential mean of its last frames' ways does.
+slow grain goes (docs/heap.md, "What carries a slide"). The exponential mean of its last frames' ways does.
 """
 
 from dataclasses import replace
