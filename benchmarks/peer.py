@@ -3,7 +3,7 @@
 Reads FOLDER/graph.npz and writes FOLDER/SYSTEM.npz: weights, output and weight gradients on that graph, with the
 weights laid out as `ContactNetwork` reads them. Says who it is, and how long the first calls took; then answers every
 line on stdin, "forward" or "forward_backward", with its wall-clock and processor seconds. Lines on stdout are JSON.
-Imports nothing of the project unless SYSTEM is `gns_pyg` or `gns_pyg, bfloat16`.
+"NAME, bfloat16" is the system NAME under autocast. Imports nothing of the project unless NAME is `gns_pyg`.
 """
 
 import json
@@ -69,14 +69,15 @@ class Torch:
     Args:
         network: called with (nodes, edges, edge_index).
         parts: its MLPs in the order of `ROLES`.
+        bfloat16: multiplies in bfloat16, under autocast (as `execution.precision` does).
     """
 
-    def __init__(self, network: Any, parts: list[Any], order: Order, version: str = "") -> None:
+    def __init__(self, network: Any, parts: list[Any], order: Order, *, bfloat16: bool) -> None:
         import torch
 
         torch.set_num_threads(1)
-        self.torch, self.network, self.parts, self.order = torch, network, parts, order
-        self.version = f"{version} PyTorch {torch.__version__}".strip()
+        self.torch, self.network, self.parts, self.order, self.bfloat16 = torch, network, parts, order, bfloat16
+        self.version = f"PyTorch {torch.__version__}"
 
     def inputs(self, graph: dict[str, np.ndarray]) -> list[Any]:
         index = np.stack([graph["senders"], graph["receivers"]])
@@ -85,11 +86,15 @@ class Torch:
     def forward(self, *inputs: Any) -> np.ndarray:
         self.network.eval()
         with self.torch.inference_mode():
-            return self.network(*inputs).numpy()
+            return self.output(*inputs).numpy()
 
     def forward_backward(self, *inputs: Any) -> None:
         self.network.train()
-        self.network(*inputs).square().mean().backward()
+        self.output(*inputs).square().mean().backward()
+
+    def output(self, *inputs: Any) -> Any:
+        with self.torch.autocast("cpu", self.torch.bfloat16, enabled=self.bfloat16):
+            return self.network(*inputs).float()
 
     def step(self) -> None:
         with self.torch.no_grad():
@@ -111,10 +116,11 @@ def gns_pyg(graph: dict[str, np.ndarray], *, bfloat16: bool = False) -> Torch:
 
     from gns_pyg.models.contact_network import ContactNetwork
 
+    torch.manual_seed(0)  # the same weights in either precision
+
     class Ours(torch.nn.Module):
         def __init__(self) -> None:
             super().__init__()
-            torch.manual_seed(0)  # the same weights in either precision
             n_receiver, n_edge = graph["nodes"].shape[1], graph["edges"].shape[1]
             sizes: dict[str, Any] = {"hidden": HIDDEN, "layers": ROUNDS_OF_MESSAGES, "mlp_layers": LINEAR_LAYERS}
             self.network = ContactNetwork(
@@ -122,15 +128,16 @@ def gns_pyg(graph: dict[str, np.ndarray], *, bfloat16: bool = False) -> Torch:
             )
 
         def forward(self, nodes: Any, edges: Any, edge_index: Any) -> Any:
-            with torch.autocast("cpu", torch.bfloat16, enabled=bfloat16):  # as `execution.precision` does
-                return self.network(None, nodes, edges, edge_index).float()
+            return self.network(None, nodes, edges, edge_index)
 
-    return Torch(Ours(), [], {})
+    return Torch(Ours(), [], {}, bfloat16=bfloat16)
 
 
-def geoelements(graph: dict[str, np.ndarray]) -> Torch:
+def geoelements(graph: dict[str, np.ndarray], *, bfloat16: bool = False) -> Torch:
     import torch
     from gns.graph_network import EncodeProcessDecode
+
+    torch.manual_seed(0)
 
     class Gns(torch.nn.Module):
         def __init__(self) -> None:
@@ -144,7 +151,8 @@ def geoelements(graph: dict[str, np.ndarray]) -> Torch:
     gns = Gns()
     encoder, processor, decoder = gns.network._encoder, gns.network._processor, gns.network._decoder
     rounds = [part for layer in processor.gnn_stacks for part in (layer.edge_fn, layer.node_fn)]
-    return Torch(gns, [encoder.node_fn, encoder.edge_fn, *rounds, decoder.node_fn], {"update": [1, 0]})
+    parts = [encoder.node_fn, encoder.edge_fn, *rounds, decoder.node_fn]
+    return Torch(gns, parts, {"update": [1, 0]}, bfloat16=bfloat16)
 
 
 class LagrangeBench:
@@ -203,6 +211,7 @@ SYSTEMS: dict[str, Any] = {
     "gns_pyg": gns_pyg,
     "gns_pyg, bfloat16": partial(gns_pyg, bfloat16=True),
     "geoelements": geoelements,
+    "geoelements, bfloat16": partial(geoelements, bfloat16=True),
     "LagrangeBench": LagrangeBench,
 }
 

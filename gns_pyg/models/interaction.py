@@ -95,7 +95,7 @@ class Interaction(MessagePassing):
                 constant = self.from_edge.weight @ lacking
             for edge, latent, receiver in zip(edges, of_ends, blocks(ends.index[1], wide), strict=True):
                 messages = function(latent.add_(dense(edge, self.from_edge.weight, constant)).relu_())
-                received.index_add_(0, receiver, messages.to(received.dtype))  # sums stay in full precision
+                received.index_add_(0, receiver, messages)
                 if self.skip and not self.last:
                     messages = edge + messages if affine is None else edge.addcmul_(messages, affine[0])
                 after.append(messages)
