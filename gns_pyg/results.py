@@ -144,7 +144,9 @@ def held_out(name: str, condition: str, expected: Climatology) -> dict[str, Any]
 def _condition(name: str, frame_dt_s: float) -> tuple[Scene, list[Trajectory]]:
     found = open_condition(name, frame_dt_s)
     if found is None:
-        raise DataError(name, "no such folder of cases", "one in $GNS_DATA or data/", "generate them, docs/full_size.md")
+        raise DataError(
+            name, "no such folder of cases", "one in $GNS_DATA or data/", "generate them, docs/full_size.md"
+        )
     return found
 
 

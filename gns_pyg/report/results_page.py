@@ -30,13 +30,14 @@ HEAD = """# Results
 
 Written by `gns_pyg.results` from [results.json](results.json): the bundles that ship with the project, on Yade cases
 that they have not seen. First the reduced scenes (220 to 300 grains; `make results`, on the embedded cases), then the
-paper's at full size (`hopper_full`, `drum_full`; on cases made by the commands in [full_size.md](full_size.md)). How these
-bundles came about is in [experiments.md](experiments.md), [answers.md](answers.md) and [full_size.md](full_size.md). Means
-over unseen cases, ± the standard deviation over them; roll-outs from 0.1 s to the end, read every 10 ms. The last
-column says whether the goal that we set ourselves holds, on this scene and these cases. Twins are two DEM runs that
-start a micrometre apart: where they differ by more than a goal allows, DEM itself does not meet it. Times are of that
-run, whatever else the machine did, Yade's too (alone, it takes half as long on the full-size hopper, less than the
-network: [full_size.md](full_size.md)); [performance.md](performance.md) measures speed with care.
+paper's at full size (`hopper_full`, `drum_full`; on cases made by the commands in [full_size.md](full_size.md)). How
+these bundles came about is in [experiments.md](experiments.md), [answers.md](answers.md) and
+[full_size.md](full_size.md). Means over unseen cases, ± the standard deviation over them; roll-outs from 0.1 s to the
+end, read every 10 ms. The last column says whether the goal that we set ourselves holds, on this scene and these
+cases. Twins are two DEM runs that start a micrometre apart: where they differ by more than a goal allows, DEM itself
+does not meet it. Times are of that run, whatever else the machine did, Yade's too (alone, it takes half as long on
+the full-size hopper, less than the network: [full_size.md](full_size.md)); [performance.md](performance.md) measures
+speed with care.
 """
 
 
