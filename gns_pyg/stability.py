@@ -17,7 +17,7 @@ from gns_pyg.report.verdict import verdict_markdown
 
 def collect(runs: Path, docs: Path, shipped: Path = SHIPPED) -> dict[str, Any]:
     """Reads runs/<bundle>/stability.json of every bundle, writes stability.json, stability.md and the pictures, and
-    puts each verdict into the bundle of that name, whose pages show it.
+    puts each verdict into the bundle of that name, whose pages show it. Verdicts of other bundles stay.
 
     Raises:
         DataError: if there is none.
@@ -30,7 +30,9 @@ def collect(runs: Path, docs: Path, shipped: Path = SHIPPED) -> dict[str, Any]:
         picture = path.parent / "plots" / "stability.png"
         shutil.copyfile(picture, docs / "figures" / f"stability_{path.parent.name}.png")
     plain = {name: {key: value for key, value in entry.items() if key != "curves"} for name, entry in found.items()}
-    write_json(docs / "stability.json", plain)
+    stored = docs / "stability.json"
+    before = json.loads(stored.read_text()) if stored.is_file() else {}
+    write_json(stored, before | plain)
     for name, entry in plain.items():
         if (shipped / name).is_dir():
             write_json(shipped / name / "stability.json", entry)
