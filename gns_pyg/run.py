@@ -227,8 +227,11 @@ def stress(cfg: DictConfig) -> dict[str, Any]:
     found |= {"processor": machine.processor(), "lines": [line.plain() for line in lines], "curves": bench.curves}
     write_json(folder / "stability.json", found)
     title = f"{cfg.bundle}: {simulator.scene.name} at the extremes"
-    write_figure(draw_verdict(bench.curves, title), folder / "plots" / "stability")
-    log.info("\n%s", verdict_table(lines, title, {"run folder": folder, "picture": folder / "plots/stability.png"}))
+    places = {"run folder": folder}
+    if (figure := draw_verdict(bench.curves, title)) is not None:
+        write_figure(figure, folder / "plots" / "stability")
+        places["picture"] = folder / "plots" / "stability.png"
+    log.info("\n%s", verdict_table(lines, title, places))
     failed = [line.line for line in lines if line.holds is False]
     if failed:
         remedy = "see stability.json for what was found; docs/stability.md says what helps"

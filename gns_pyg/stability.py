@@ -28,7 +28,8 @@ def collect(runs: Path, docs: Path, shipped: Path = SHIPPED) -> dict[str, Any]:
     found = {path.parent.name: json.loads(path.read_text()) for path in paths}
     for path in paths:
         picture = path.parent / "plots" / "stability.png"
-        shutil.copyfile(picture, docs / "figures" / f"stability_{path.parent.name}.png")
+        if picture.is_file():
+            shutil.copyfile(picture, docs / "figures" / f"stability_{path.parent.name}.png")
     plain = {name: {key: value for key, value in entry.items() if key != "curves"} for name, entry in found.items()}
     stored = docs / "stability.json"
     before = json.loads(stored.read_text()) if stored.is_file() else {}

@@ -6,6 +6,7 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
+from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
 from gns_pyg.evaluation.stress import Line
@@ -55,22 +56,29 @@ def verdict_markdown(lines: Sequence[Mapping[str, Any]]) -> str:
     return "\n".join(rows)
 
 
-def draw_verdict(curves: Mapping[str, Any], title: str) -> Figure:
-    """Kinetic energy of the long roll-out beside DEM's, and how far the settled pile has moved."""
-    figure = Figure(figsize=(9, 3.6), layout="constrained")
-    energy, pile = figure.subplots(1, 2)
-    if found := curves.get("long"):
-        if "dem_times_s" in found:
-            energy.plot(found["dem_times_s"], found["dem_energy_j"], color="0.55", label="DEM", linewidth=1.5)
-        energy.plot(
-            found["times_s"], found["energy_j"], color="#0072B2", label="network", linewidth=1.0, linestyle="--"
-        )
-        energy.set_yscale("symlog", linthresh=1e-6)
-        energy.legend(frameon=False)
-    energy.set(xlabel="time, s", ylabel="kinetic energy, J", title="ten times the trained length")
-    if found := curves.get("settled"):
-        steps = np.linspace(0, found["steps"], len(found["moved_m"]))
-        pile.plot(steps, 1e3 * np.array(found["moved_m"]), color="#D55E00")
-    pile.set(xlabel="step", ylabel="centre of mass moved, mm", title="settled pile")
+def draw_verdict(curves: Mapping[str, Any], title: str) -> Figure | None:
+    """Kinetic energy of the long roll-out beside DEM's, and how far the settled pile has moved: of what was run; None
+    where neither was."""
+    drawn = [(draw, curves[name]) for name, draw in (("long", _energy), ("settled", _pile)) if name in curves]
+    if not drawn:
+        return None
+    figure = Figure(figsize=(4.5 * len(drawn), 3.6), layout="constrained")
+    for axes, (draw, found) in zip(figure.subplots(1, len(drawn), squeeze=False)[0], drawn, strict=True):
+        draw(axes, found)
     figure.suptitle(title)
     return figure
+
+
+def _energy(axes: Axes, found: Mapping[str, Any]) -> None:
+    if "dem_times_s" in found:
+        axes.plot(found["dem_times_s"], found["dem_energy_j"], color="0.55", label="DEM", linewidth=1.5)
+    axes.plot(found["times_s"], found["energy_j"], color="#0072B2", label="network", linewidth=1.0, linestyle="--")
+    axes.set_yscale("symlog", linthresh=1e-6)
+    axes.legend(frameon=False)
+    axes.set(xlabel="time, s", ylabel="kinetic energy, J", title="ten times the trained length")
+
+
+def _pile(axes: Axes, found: Mapping[str, Any]) -> None:
+    steps = np.linspace(0, found["steps"], len(found["moved_m"]))
+    axes.plot(steps, 1e3 * np.array(found["moved_m"]), color="#D55E00")
+    axes.set(xlabel="step", ylabel="centre of mass moved, mm", title="settled pile")

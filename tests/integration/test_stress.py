@@ -37,6 +37,7 @@ def test_the_architecture_alone(tmp_path):
     small = ["model.hidden=16", "model.layers=1"]
     found = run.stress(config(tmp_path, "bundle=untrained", "scene=drum_small", *small, lines))
     assert [line["holds"] for line in found["lines"]] == [True] * 6
+    assert not (tmp_path / "plots").exists()  # nothing of what is drawn was run
 
 
 def test_a_line_that_fails_is_named_and_the_rest_is_written(tmp_path, monkeypatch):
