@@ -40,9 +40,13 @@ OURS, KINDS = "gns_pyg", ("forward", "forward_backward")
 ROUNDED = ", bfloat16"  # a system again, in fewer bits: its outputs are compared with its own in float32
 TOLERANCE, OF_ROUNDED = 1e-4, 2e-2
 HERE = "gns_pyg/models"
-# system -> its package
-SYSTEMS = {OURS: HERE, OURS + ROUNDED: HERE, "geoelements": "gns", f"geoelements{ROUNDED}": "gns"}
-SYSTEMS["LagrangeBench"] = "lagrangebench"
+SYSTEMS = {  # system -> its package
+    OURS: HERE,
+    OURS + ROUNDED: HERE,
+    "geoelements": "gns",
+    f"geoelements{ROUNDED}": "gns",
+    "LagrangeBench": "lagrangebench",
+}
 NOT_HERE = {"PhysicsNeMo": "sums messages after their residual, another function; needs Warp, s3fs, torchvision"}
 N_NODES, N_PAIRS, TIME_S = 2530, 13035, 1.5
 CASE = Path(os.environ.get("GNS_DATA", "data")) / "drum" / "case_000.h5"

@@ -11,6 +11,7 @@ from matplotlib.figure import Figure
 
 from gns_pyg.evaluation.stress import Line
 
+LEAST_J = 1e-6  # a picture of energies is linear below
 MARKS = {True: "holds", False: "FAILS", None: "-"}
 
 
@@ -73,7 +74,10 @@ def _energy(axes: Axes, found: Mapping[str, Any]) -> None:
     if "dem_times_s" in found:
         axes.plot(found["dem_times_s"], found["dem_energy_j"], color="0.55", label="DEM", linewidth=1.5)
     axes.plot(found["times_s"], found["energy_j"], color="#0072B2", label="network", linewidth=1.0, linestyle="--")
-    axes.set_yscale("symlog", linthresh=1e-6)
+    axes.set_yscale("symlog", linthresh=LEAST_J)
+    energies = np.concatenate([line.get_ydata() for line in axes.lines])
+    if energies.min() > LEAST_J:  # whole decades: within one, a logarithmic axis has no two numbers to read it by
+        axes.set_ylim(10 ** np.floor(np.log10(energies.min())), 10 ** np.ceil(np.log10(energies.max())))
     axes.legend(frameon=False)
     axes.set(xlabel="time, s", ylabel="kinetic energy, J", title="ten times the trained length")
 
