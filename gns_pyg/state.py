@@ -6,7 +6,7 @@ Several graphs are batched by concatenating their grains; `batch` says which gra
 
 from collections.abc import Sequence
 from dataclasses import dataclass, fields, replace
-from typing import TypeVar
+from typing import Any, TypeVar
 
 import torch
 from jaxtyping import Bool, Float, Int
@@ -24,11 +24,23 @@ def constant(values: Sequence[float | int], like: Tensor) -> Tensor:
 
 def fine(values: Tensor, unit: Tensor | float) -> Tensor:
     """On a scale that is linear up to `unit` and logarithmic beyond."""
-    size = values / unit
-    sign = torch.copysign(torch.ones_like(size), size)  # never 0, so that the gradient at 0 is right
-    size = size * sign
-    # asinh, whose own kernel takes longer on a CPU; beyond 1e19, where the square overflows, log(2) too small
-    return sign * torch.log1p(size + size * (size / (1 + (size * size + 1).sqrt()))) / 4
+    return Asinh.apply(values / unit) / 4
+
+
+class Asinh(torch.autograd.Function):
+    """The inverse hyperbolic sine, in half of the time of torch's own on a CPU; beyond 1e19, where a square overflows
+    in float32, log(2) too small."""
+
+    @staticmethod
+    def forward(ctx: Any, x: Tensor) -> Tensor:
+        ctx.save_for_backward(x)
+        size, root = x.abs(), (x * x).add_(1).sqrt_().add_(1)
+        return torch.div(size, root, out=root).mul_(size).add_(size).log1p_().copysign_(x)
+
+    @staticmethod
+    def backward(ctx: Any, gradient: Tensor) -> Tensor:
+        (x,) = ctx.saved_tensors
+        return gradient / (x * x + 1).sqrt()
 
 
 def reached(n: int, *rows: Int[Tensor, " _"]) -> Bool[Tensor, " n"]:

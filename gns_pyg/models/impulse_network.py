@@ -18,7 +18,7 @@ from torch import Tensor, nn
 from torch.nn.functional import embedding_bag
 from torch_geometric.nn import MessagePassing
 
-from gns_pyg.models.mlp import ROWS, blocks, linear, mlp, only, recurring
+from gns_pyg.models.mlp import ROWS, blocks, dense, linear, mlp, only, recurring
 from gns_pyg.state import SOFT, Contacts, fine, reached
 
 VELOCITY, MEAN, GAINED = 0, 1, 2  # channels: end velocity, mean velocity's correction, what gravity adds in a frame
@@ -51,8 +51,10 @@ class Piece:
         ends: their grains: receiver, between grains then sender.
         stacked: the same where what receivers show is followed by what senders do.
         basis: the contacts' directions; first the normal.
-        told: `ends` without what fills up their number, side by side.
-        share: how much more each of them is moved than the other (see `Contacts`).
+        share: how much more each of them is moved than the other (see `Contacts`); all receivers, then all senders.
+        contact: what each grain is told by, grain after grain, without what fills up the contacts' number.
+        side: the same where what receivers are told is followed by what senders are.
+        first: where each grain's begin.
     """
 
     ends: Int[Tensor, "e sides"]
@@ -60,10 +62,12 @@ class Piece:
     scalars: Float[Tensor, "e f"]
     basis: Float[Tensor, "3 b e"]
     slow: float
-    wall_vel: Float[Tensor, "e 3"] | None
-    drift: Float[Tensor, "e d"] | None
-    told: tuple[Int[Tensor, " m"], ...]
-    share: tuple[Float[Tensor, "m 1"], ...] | None
+    wall_vel: Float[Tensor, "3 1 e"] | None
+    drift: Float[Tensor, "d e"] | None
+    share: Float[Tensor, " e_sides"] | None
+    contact: Int[Tensor, " m"]
+    side: Int[Tensor, " m"]
+    first: Int[Tensor, " n"]
 
 
 class ImpulseNetwork(nn.Module):
@@ -157,52 +161,57 @@ class ImpulseRound(MessagePassing):
     def forward(
         self, grains: Grains, contacts: Sequence[Piece], edges: Sequence[Tensor], hears: Bool[Tensor, " n"]
     ) -> tuple[Grains, list[Tensor]]:
-        n, heard, third = len(grains.latent), 0 if self.update_mlp is None else self.hidden, 3 * self.channels
         motion = torch.cat([grains.vel.flatten(1), grains.spin.flatten(1)], dim=1)
-        sign = motion.new_ones(heard + 2 * third)
-        sign[heard : heard + third] = -1  # the sender's impulse; what it hears and how it turns are the receiver's
-        latent, after = linear(self.from_ends, grains.latent), []
-        moving = torch.cat([motion * sign[heard:], motion])
-        gained = motion.new_zeros(n, len(sign))
+        sign = motion.new_ones(motion.shape[1])
+        sign[: 3 * self.channels] = -1  # slip is the sender's velocity less the receiver's, of spins it takes the sum
+        moving, latent = torch.cat([motion * sign, motion]), linear(self.from_ends, grains.latent)
+        gained, heard, after = torch.zeros_like(motion), torch.zeros_like(grains.latent), []
         for piece, before in zip(contacts, edges, strict=True):
             edge, message, change = self.edge_update(piece, before, latent, moving)
-            rows = torch.cat([message[:, :heard], change], dim=1).to(motion.dtype)[: len(piece.told[0])]
-            for side, named in enumerate(piece.told):
-                given = rows
-                if piece.share is not None:
-                    given = torch.cat([rows[:, :heard], rows[:, heard:] * piece.share[side]], dim=1)
-                told = self.aggregate(given, named, dim_size=n)  # sums stay in full precision
-                gained = gained + told * sign if side else gained + told
+            gained = gained + self.aggregate(change, piece.side, piece.first)
+            if self.update_mlp is not None:
+                heard = heard + self.aggregate(message.to(heard.dtype), piece.contact, piece.first)
             after.append(edge)
-        vel, spin = (part.view(grains.vel.shape) for part in gained[:, heard:].chunk(2, dim=1))
+        vel, spin = (part.view(grains.vel.shape) for part in gained.chunk(2, dim=1))
         there = grains.latent
         if self.update_mlp is not None:  # of those that hear: a network that reaches nobody changes nothing
-            there = there + only(hears, self.update_mlp, torch.cat([there, gained[:, :heard]], dim=1), self.hidden)
+            there = there + only(hears, self.update_mlp, torch.cat([there, heard], dim=1), self.hidden)
         return Grains(there, grains.vel + vel, grains.spin + spin), after
+
+    def aggregate(self, rows: Tensor, named: Tensor, first: Tensor) -> Tensor:  # type: ignore[override]
+        """The sum of the rows that are named for each grain, whose begin at `first`; in full precision, and always in
+        the same order."""
+        return embedding_bag(named, rows, first, mode="sum")
 
     def edge_update(
         self, contacts: Piece, edge: Tensor, latent: Tensor, moving: Tensor
     ) -> tuple[Tensor, Tensor, Tensor]:
-        """What every contact knows after this round, says to its grains, and gives the receiver: impulse and turn in
-        every channel, (n_contacts, 6 channels)."""
-        hidden, basis = gathered(latent, contacts.ends), contacts.basis
+        """What every contact knows after this round, says to its grains, and gives them: impulse and turn in every
+        channel, to all receivers, then to all senders, (sides x n_contacts, 6 channels)."""
+        basis, (first, _, last) = contacts.basis, self.impulse_mlp
         rel_vel, spin = gathered(moving, contacts.stacked).t().contiguous().view(2, 3, self.channels, -1)
         if contacts.wall_vel is not None:
-            rel_vel = torch.cat([rel_vel[:, :1] + contacts.wall_vel.t()[:, None], rel_vel[:, 1:]], dim=1)
+            rel_vel = torch.cat([rel_vel[:, :1] + contacts.wall_vel, rel_vel[:, 1:]], dim=1)
         slip = rel_vel - cross(spin, basis[:, :1])  # of the surfaces in touch
         along = (basis[:, :, None] * slip[:, None]).sum(0).flatten(0, 1)
         speed = (slip.square().sum(0) + SOFT).sqrt()
-        seen = torch.cat([along, speed])
-        seen = torch.cat([seen, fine(seen, contacts.slow)]).t().contiguous()
-        known = hidden + linear(self.from_edge, edge) + linear(self.from_seen, seen)
+        seen, weight = torch.cat([along, speed]), self.from_seen.weight
+        seen = torch.cat([seen, fine(seen, contacts.slow)])
         if self.from_drift is not None and contacts.drift is not None:
-            known = known + linear(self.from_drift, contacts.drift)
-        message = self.message_mlp(known.relu_())
+            seen, weight = torch.cat([seen, contacts.drift]), torch.cat([weight, self.from_drift.weight], dim=1)
+        known = gathered(latent, contacts.ends) + dense(edge, self.from_edge.weight, self.from_seen.bias)
+        message = self.message_mlp(torch.addmm(known, seen.t(), weight.t()).relu_())
         edge = edge + message
-        factors = self.impulse_mlp(edge).t().contiguous().view(basis.shape[1] + 1, self.channels, len(edge))
+        factors = torch.addmm(last.bias[:, None], last.weight, linear(first, edge).relu_().t())
+        factors = factors.view(basis.shape[1] + 1, self.channels, len(edge))
         against = factors[-1] / (1 + (speed / FASTEST).square()).sqrt()
         impulse = (basis[:, :, None] * factors[:-1]).sum(1) + against * slip
-        change = torch.cat([impulse, -SPHERE * cross(impulse, basis[:, :1])])
+        turn = -SPHERE * cross(impulse, basis[:, :1])
+        change = torch.cat([impulse, turn])
+        if self.mutual:
+            change = torch.cat([change, torch.cat([-impulse, turn])], dim=2)
+        if contacts.share is not None:
+            change = change * contacts.share
         return edge, message, change.flatten(0, 1).t().contiguous()
 
 
@@ -237,26 +246,30 @@ class Damping(nn.Module):
 
 def pieces(contacts: Contacts, hidden: int, n: int, *, mutual: bool) -> list[Piece]:
     """Contacts between `n` grains as pieces that are best handled one after the other."""
-    sides = contacts.ends.flip(0)[: 1 + mutual]
-    always = [blocks(side, hidden) for side in (sides.T, contacts.scalars, contacts.basis)]
-    none = [None] * len(always[0])
-    perhaps = [
-        none if side is None else blocks(side, hidden) for side in (contacts.wall_vel, contacts.drift, contacts.share)
-    ]
+    named = contacts.ends.flip(0)[: 1 + mutual].t()
+    optional = (contacts.wall_vel, contacts.drift, contacts.share)
+    parts = [blocks(rows, hidden) for rows in (named, contacts.scalars, contacts.basis)]
+    parts += [[None] * len(parts[0]) if rows is None else blocks(rows, hidden) for rows in optional]
     found = []
-    for ends, scalars, basis, wall_vel, drift, share in zip(*always, *perhaps, strict=True):
-        more = recurring(ends, ROWS, hidden)
+    for ends, *values in zip(*parts, strict=True):
+        grain, order = ends.t().flatten().sort(stable=True)
+        side, contact = order // max(1, len(ends)), order % max(1, len(ends))
+        ends, scalars, basis, wall_vel, drift, share = (
+            None if rows is None else recurring(rows, ROWS, hidden) for rows in (ends, *values)
+        )
         found.append(
             Piece(
-                ends=more,
-                stacked=torch.stack([side + k * n for k, side in enumerate(more.unbind(1))], dim=1),
-                scalars=recurring(scalars, ROWS, hidden),
-                basis=recurring(basis, ROWS, hidden).permute(1, 2, 0).contiguous(),
+                ends=ends,
+                stacked=ends + n * torch.arange(ends.shape[1], device=ends.device),
+                scalars=scalars,
+                basis=basis.permute(1, 2, 0).contiguous(),
                 slow=contacts.slow,
-                wall_vel=None if wall_vel is None else recurring(wall_vel, ROWS, hidden),
-                drift=None if drift is None else recurring(drift, ROWS, hidden),
-                told=ends.unbind(1),
-                share=None if share is None else share.flip(1).split(1, dim=1),
+                wall_vel=None if wall_vel is None else wall_vel.t()[:, None],
+                drift=None if drift is None else drift.t(),
+                share=None if share is None else share.flip(1).t().flatten(),
+                contact=contact,
+                side=contact + side * len(ends),
+                first=torch.searchsorted(grain, torch.arange(n, device=grain.device)),
             )
         )
     return found
