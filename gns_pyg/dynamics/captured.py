@@ -88,7 +88,9 @@ class Captured:
             state.pos, state.batch, state.pos, state.batch, simulator.cutoff_m, next(rooms), next(rooms)
         )
         kept = torch.ones_like(edges[0], dtype=torch.bool)
-        if not simulator.config.self_loops:
+        if simulator.pairs_once:
+            kept = edges[0] < edges[1]
+        elif not simulator.config.self_loops:
             kept = edges[0] != edges[1]
         if len(simulator.scene.grains.radii_m) > 1:
             kept = kept & simulator.in_reach(everyone, edges)
@@ -107,9 +109,6 @@ class Captured:
                 graph = Graph(pairs, contacts, walls)
             else:
                 graph = _among(graph, can_touch(graph, meet, meet_wall, n + 1), nobody, nothing)
-        if simulator.pairs_once:
-            edges = graph.grain_edges
-            graph = replace(graph, grain_edges=_only(edges, edges[0] < edges[1], nobody))
         return graph, torch.stack(needed)
 
     def _contacts(

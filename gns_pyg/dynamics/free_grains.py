@@ -63,8 +63,10 @@ def meeting(graph: Graph, near: Bool[Tensor, " e"], near_wall: Bool[Tensor, " w"
 
 def can_touch(graph: Graph, near: Bool[Tensor, " e"], near_wall: Bool[Tensor, " w"], n: int) -> Bool[Tensor, " n"]:
     """Which of `n` grains can meet somebody, or a wall."""
-    touches = torch.zeros(n, device=near.device).index_add(0, graph.grain_edges[1], near.float())
-    return touches.index_add(0, graph.wall_edges[1], near_wall.float()) > 0
+    touches = torch.zeros(n, device=near.device)
+    for named, close in ((graph.grain_edges[0], near), (graph.grain_edges[1], near), (graph.wall_edges[1], near_wall)):
+        touches = touches.index_add(0, named, close.float())
+    return touches > 0
 
 
 def among(graph: Graph, touches: Bool[Tensor, " n_grains"]) -> Graph:

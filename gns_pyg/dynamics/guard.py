@@ -171,10 +171,12 @@ class PartGuard(nn.Module):
         self, start: Float[Tensor, "n 3"], end: Float[Tensor, "n 3"]
     ) -> tuple[Int[Tensor, " m"], Int[Tensor, " m"], Float[Tensor, " m"]]:
         """Every meeting of a line with a triangle: line, plane, and after which part of the line."""
-        above, below = (torch.addmm(-self.offset, at, self.normal.T) for at in (start, end))
-        comes = above >= -self.tolerance_m
-        line, plane = (comes & (below < self.tolerance_m) & (below < above)).nonzero().unbind(1)
-        height, depth = above[line, plane].clamp(min=0), below[line, plane]
+        above, way = torch.addmm(-self.offset, start, self.normal.T), torch.linalg.vector_norm(end - start, dim=1)
+        near = (above >= -self.tolerance_m) & (above <= (way + 2 * self.tolerance_m)[:, None])
+        line, plane = near.nonzero().unbind(1)
+        above, below = above[line, plane], self._height(end[line], plane)
+        meets = (below < self.tolerance_m) & (below < above)
+        line, plane, height, depth = line[meets], plane[meets], above[meets].clamp(min=0), below[meets]
         part_of_way = (height / (height - depth).clamp(min=self.tolerance_m)).clamp(max=1)
         meets = start[line] + part_of_way[:, None] * (end[line] - start[line])
         n_triangles = self.first[plane + 1] - self.first[plane]

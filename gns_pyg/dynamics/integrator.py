@@ -76,8 +76,9 @@ class Integrator:
 
     def gained(self, state: State) -> Float[Tensor, " n_grains"]:
         """Speed of each grain after a frame of free flight from rest, m/s."""
-        still = torch.zeros_like(state.vel)
-        return torch.linalg.vector_norm(self.without_contact(replace(state, vel=still)).vel, dim=1)
+        felt = self.damping(state) if self.scene.damping_on_gravity else 0.0
+        per_s = math.hypot(*self.scene.gravity_m_s2) if self.free_flight else 0.0
+        return torch.full_like(state.pos[:, 0], per_s * self.dt_s) * (1 - felt)
 
     def damping(self, state: State) -> Float[Tensor, " n_grains"]:
         """Of each grain: its case's own where cases vary, else the scene's."""

@@ -228,7 +228,7 @@ class Simulator(nn.Module):
             options |= dict(friction=self.requires.wall_friction, moving=self.requires.wall_velocity)
             kinds.append((self.wall_network, contacts.wall_contacts(state, free_vel, graph, graph.walls, **options)))
         after = exchange(grains, kinds)
-        vel, spin = after.vel - grains.vel, after.spin - grains.spin
+        vel, spin = (after.motion - grains.motion).unbind(1)
         groups = [vel[:, :, MEAN], vel[:, :, VELOCITY], spin[:, :, VELOCITY] + spin[:, :, MEAN]]
         if self.requires.damped:
             groups = self._damped(state, free_vel, graph, groups, self.damping(grains, after, slow))
@@ -246,21 +246,22 @@ class Simulator(nn.Module):
         """What damping leaves of what contacts have changed, of grains that something reaches: back comes what damping
         takes from gravity in free flight, as far as others bear a grain; a share of its motion goes; and what they
         give is damped too."""
-        free, velocity_m_s = self.integrator.without_contact(state), self.statistics.velocity_m_s
+        free, dt_s, dtype = self.integrator.without_contact(state), self.scene.frame_dt_s, shares.dtype
         spin = torch.zeros_like(free_vel) if state.ang_vel is None else state.radius[:, None] * state.ang_vel
-        without = [(state.vel + free_vel) / 2, free_vel, spin]  # undamped
-        taken = [without[0] - (free.pos - state.pos) / self.scene.frame_dt_s, without[1] - free.vel]
-        start, damping = [state.vel, state.vel, spin], self.integrator.damping(state)[:, None].to(shares.dtype)
-        start, without, taken = ([(x / velocity_m_s).to(shares.dtype) for x in xs] for xs in (start, without, taken))
+        start = torch.stack([state.vel, state.vel, spin])
+        without = torch.stack([(state.vel + free_vel) / 2, free_vel, spin])  # undamped
+        taken = without[:2] - torch.stack([(free.pos - state.pos) / dt_s, free.vel])
+        start, without, taken = ((x / self.statistics.velocity_m_s).to(dtype) for x in (start, without, taken))
+        damping, given = self.integrator.damping(state)[:, None].to(dtype), torch.stack(groups)
+        drive = without - start if self.scene.damping_on_gravity else torch.zeros_like(start)
+        added = cundall(start, drive + given, damping) - cundall(start, drive, damping)
+        borne, slowed, felt = (
+            shares[:, part].t()[:, :, None] for part in (Damping.BORNE, Damping.SLOWED, Damping.FELT)
+        )
+        left = given - slowed * (without + given) + felt * added
+        left = torch.cat([left[:2] + borne * taken, left[2:]])
         touched = reached(len(state.pos), *graph.grain_edges, graph.wall_edges[1])
-        borne, slowed, felt = (shares[:, part] for part in (Damping.BORNE, Damping.SLOWED, Damping.FELT))
-        found = []
-        for k, (given, own, vel) in enumerate(zip(groups, without, start, strict=True)):
-            drive = own - vel if self.scene.damping_on_gravity else torch.zeros_like(vel)
-            added = cundall(vel, drive + given, damping) - cundall(vel, drive, damping)
-            left = given - slowed[:, k, None] * (own + given) + felt[:, k, None] * added
-            found.append(left + borne[:, k, None] * taken[k] if k < len(taken) else left)
-        return [torch.where(touched[:, None], left, 0.0) for left in found]
+        return list(torch.where(touched[:, None], left, 0.0))
 
     def _grains(self, state: State, free_vel: Float[Tensor, "n_grains 3"]) -> Grains:
         """What grains carry into the first round: their speeds, and what they would do without contact."""
@@ -269,10 +270,10 @@ class Simulator(nn.Module):
         speeds = ((state.vel, velocity_m_s), (ang_vel, self.statistics.spin_rad_s))
         columns = [torch.linalg.vector_norm(x, dim=1, keepdim=True) / scale for x, scale in speeds]
         latent = self.encode_grain(torch.cat(columns + self._kinds(state), dim=1).to(dtype))
-        carried = state.vel.new_zeros(2, len(state.vel), 3, self.config.channels)
-        carried[0, :, :, VELOCITY], carried[0, :, :, GAINED] = free_vel, free_vel - state.vel
-        carried[1, :, :, VELOCITY] = state.radius[:, None] * ang_vel
-        return Grains(latent, *(carried / velocity_m_s).to(dtype))
+        motion = state.vel.new_zeros(len(state.vel), 2, 3, self.config.channels)
+        motion[:, 0, :, VELOCITY], motion[:, 0, :, GAINED] = free_vel, free_vel - state.vel
+        motion[:, 1, :, VELOCITY] = state.radius[:, None] * ang_vel
+        return Grains(latent, (motion / velocity_m_s).to(dtype))
 
     @property
     def settles(self) -> bool:
@@ -313,6 +314,8 @@ class Simulator(nn.Module):
         """Who can touch whom within the cutoffs. Not differentiable."""
         state = replace(state, pos=state.pos.detach(), vel=state.vel.detach())
         edges = self.pairs_in_reach(state)
+        if self.pairs_once:
+            edges = edges[:, edges[0] < edges[1]]
         graph = Graph(edges, edges.new_empty(2, 0))
         if self.boundary is not None:
             walls, contacts = self.boundary.contacts(state)
@@ -321,9 +324,6 @@ class Simulator(nn.Module):
             near = self.near(state, graph)
             alone = self.requires.touching_pairs
             graph = meeting(graph, *near) if alone else among(graph, can_touch(graph, *near, len(state.pos)))
-        if self.pairs_once:
-            edges = graph.grain_edges
-            graph = replace(graph, grain_edges=edges[:, edges[0] < edges[1]])
         return graph
 
     def near(self, state: State, graph: Graph) -> tuple[Bool[Tensor, " e"], Bool[Tensor, " w"]]:

@@ -122,7 +122,7 @@ def _scalars(
     near = closeness(distance, radius)
     gap, ahead = gap / radius, ahead / radius
     slow_m_s = FINE * radius / dt_s
-    finely = [fine(gap, FINE), fine(ahead, FINE), fine(approach, slow_m_s), fine(speed, slow_m_s)]
+    finely = fine(torch.stack([gap / FINE, ahead / FINE, approach / slow_m_s, speed / slow_m_s]), 1.0)
     columns = [distance / radius, near, near**2, gap, ahead, approach / velocity_m_s, speed / velocity_m_s, *finely]
     sideways = tangential / (speed.square() + slow_m_s.square()).sqrt()[:, None]
     return torch.stack(columns, dim=1), sideways

@@ -17,6 +17,7 @@ from jaxtyping import Bool, Float, Int
 from torch import Tensor, nn
 from torch.nn.functional import embedding_bag
 from torch_geometric.nn import MessagePassing
+from torch_geometric.typing import OptTensor
 
 from gns_pyg.models.mlp import ROWS, blocks, dense, linear, mlp, only, recurring
 from gns_pyg.state import SOFT, Contacts, fine, reached
@@ -32,13 +33,11 @@ class Grains:
 
     Attributes:
         latent: (n_grains, hidden).
-        vel: velocities, dimensionless, one vector a channel, (n_grains, 3, channels).
-        spin: radius x angular velocity, likewise.
+        motion: velocity, then radius x angular velocity, dimensionless; of each one vector a channel.
     """
 
     latent: Float[Tensor, "n hidden"]
-    vel: Float[Tensor, "n 3 channels"]
-    spin: Float[Tensor, "n 3 channels"]
+    motion: Float[Tensor, "n 2 3 channels"]
 
 
 @dataclass(frozen=True)
@@ -48,26 +47,29 @@ class Piece:
 
     Attributes:
         scalars, slow, wall_vel, drift: as of `Contacts`.
-        ends: their grains: receiver, between grains then sender.
+        ends: their grains, contact after contact: receiver, between grains then sender.
         stacked: the same where what receivers show is followed by what senders do.
+        begins: where each contact's begin.
         basis: the contacts' directions; first the normal.
-        share: how much more each of them is moved than the other (see `Contacts`); all receivers, then all senders.
-        contact: what each grain is told by, grain after grain, without what fills up the contacts' number.
-        side: the same where what receivers are told is followed by what senders are.
+        told: the contacts of each grain, grain after grain, without what fills up their number.
         first: where each grain's begin.
+        share: how much more of a change they make than the other side's (see `Contacts`), None where all masses are
+            equal.
+        sign: that of the impulse: -1 for the sender's; times `share`.
     """
 
-    ends: Int[Tensor, "e sides"]
-    stacked: Int[Tensor, "e sides"]
+    ends: Int[Tensor, " e_sides"]
+    stacked: Int[Tensor, " e_sides"]
+    begins: Int[Tensor, " e"]
     scalars: Float[Tensor, "e f"]
     basis: Float[Tensor, "3 b e"]
     slow: float
     wall_vel: Float[Tensor, "3 1 e"] | None
     drift: Float[Tensor, "d e"] | None
-    share: Float[Tensor, " e_sides"] | None
-    contact: Int[Tensor, " m"]
-    side: Int[Tensor, " m"]
+    told: Int[Tensor, " m"]
     first: Int[Tensor, " n"]
+    share: Float[Tensor, " m"] | None
+    sign: Float[Tensor, " m"]
 
 
 class ImpulseNetwork(nn.Module):
@@ -161,58 +163,64 @@ class ImpulseRound(MessagePassing):
     def forward(
         self, grains: Grains, contacts: Sequence[Piece], edges: Sequence[Tensor], hears: Bool[Tensor, " n"]
     ) -> tuple[Grains, list[Tensor]]:
-        motion = torch.cat([grains.vel.flatten(1), grains.spin.flatten(1)], dim=1)
+        motion, heard, after = grains.motion.flatten(1), [], []
         sign = motion.new_ones(motion.shape[1])
         sign[: 3 * self.channels] = -1  # slip is the sender's velocity less the receiver's, of spins it takes the sum
         moving, latent = torch.cat([motion * sign, motion]), linear(self.from_ends, grains.latent)
-        gained, heard, after = torch.zeros_like(motion), torch.zeros_like(grains.latent), []
         for piece, before in zip(contacts, edges, strict=True):
-            edge, message, change = self.edge_update(piece, before, latent, moving)
-            gained = gained + self.aggregate(change, piece.side, piece.first)
+            of = piece.told, piece.first
+            edge, message, impulse, turn = self.edge_update(piece, before, latent, moving)
+            given = (self.aggregate(impulse, *of, piece.sign), self.aggregate(turn, *of, piece.share))
+            motion = motion + torch.cat(given, dim=1)
             if self.update_mlp is not None:
-                heard = heard + self.aggregate(message.to(heard.dtype), piece.contact, piece.first)
+                heard.append(self.aggregate(message.to(motion.dtype), *of))
             after.append(edge)
-        vel, spin = (part.view(grains.vel.shape) for part in gained.chunk(2, dim=1))
         there = grains.latent
         if self.update_mlp is not None:  # of those that hear: a network that reaches nobody changes nothing
-            there = there + only(hears, self.update_mlp, torch.cat([there, heard], dim=1), self.hidden)
-        return Grains(there, grains.vel + vel, grains.spin + spin), after
+            told = torch.cat([there, sum(heard[1:], heard[0])], dim=1)
+            there = there + only(hears, self.update_mlp, told, self.hidden)
+        return Grains(there, motion.view(grains.motion.shape)), after
 
-    def aggregate(self, rows: Tensor, named: Tensor, first: Tensor) -> Tensor:  # type: ignore[override]
-        """The sum of the rows that are named for each grain, whose begin at `first`; in full precision, and always in
-        the same order."""
-        return embedding_bag(named, rows, first, mode="sum")
+    def aggregate(  # type: ignore[override]
+        self, inputs: Tensor, index: Tensor, ptr: Tensor, weight: OptTensor = None
+    ) -> Tensor:
+        """The sums of rows that go together, (len(ptr), f), in full precision and always in the same order.
+
+        Args:
+            inputs: (n_rows, f).
+            index: rows in the order in which they go together.
+            ptr: where in it each sum's begin.
+            weight: of each.
+        """
+        return embedding_bag(index, inputs, ptr, mode="sum", per_sample_weights=weight)
 
     def edge_update(
         self, contacts: Piece, edge: Tensor, latent: Tensor, moving: Tensor
-    ) -> tuple[Tensor, Tensor, Tensor]:
-        """What every contact knows after this round, says to its grains, and gives them: impulse and turn in every
-        channel, to all receivers, then to all senders, (sides x n_contacts, 6 channels)."""
+    ) -> tuple[Tensor, Tensor, Tensor, Tensor]:
+        """What every contact knows after this round, says to its grains, and gives the receiver in every channel:
+        impulse and turn, (n_contacts, 3 channels)."""
         basis, (first, _, last) = contacts.basis, self.impulse_mlp
-        rel_vel, spin = gathered(moving, contacts.stacked).t().contiguous().view(2, 3, self.channels, -1)
+        rel_vel, spin = self.aggregate(moving, contacts.stacked, contacts.begins).t().contiguous().view(2, 3, self.channels, -1)
         if contacts.wall_vel is not None:
             rel_vel = torch.cat([rel_vel[:, :1] + contacts.wall_vel, rel_vel[:, 1:]], dim=1)
         slip = rel_vel - cross(spin, basis[:, :1])  # of the surfaces in touch
-        along = (basis[:, :, None] * slip[:, None]).sum(0).flatten(0, 1)
-        speed = (slip.square().sum(0) + SOFT).sqrt()
+        along = dot(basis[:, :, None], slip[:, None]).flatten(0, 1)
+        speed = (dot(slip, slip) + SOFT).sqrt()
         seen, weight = torch.cat([along, speed]), self.from_seen.weight
         seen = torch.cat([seen, fine(seen, contacts.slow)])
         if self.from_drift is not None and contacts.drift is not None:
             seen, weight = torch.cat([seen, contacts.drift]), torch.cat([weight, self.from_drift.weight], dim=1)
-        known = gathered(latent, contacts.ends) + dense(edge, self.from_edge.weight, self.from_seen.bias)
+        known = self.aggregate(latent, contacts.ends, contacts.begins) + dense(edge, self.from_edge.weight, self.from_seen.bias)
         message = self.message_mlp(torch.addmm(known, seen.t(), weight.t()).relu_())
         edge = edge + message
         factors = torch.addmm(last.bias[:, None], last.weight, linear(first, edge).relu_().t())
         factors = factors.view(basis.shape[1] + 1, self.channels, len(edge))
         against = factors[-1] / (1 + (speed / FASTEST).square()).sqrt()
-        impulse = (basis[:, :, None] * factors[:-1]).sum(1) + against * slip
-        turn = -SPHERE * cross(impulse, basis[:, :1])
-        change = torch.cat([impulse, turn])
-        if self.mutual:
-            change = torch.cat([change, torch.cat([-impulse, turn])], dim=2)
-        if contacts.share is not None:
-            change = change * contacts.share
-        return edge, message, change.flatten(0, 1).t().contiguous()
+        impulse = against * slip
+        for direction, factor in zip(basis.unbind(1), factors, strict=False):
+            impulse = torch.addcmul(impulse, direction[:, None], factor)
+        turn = cross(impulse, -SPHERE * basis[:, :1])
+        return edge, message, *(change.flatten(0, 1).t().contiguous() for change in (impulse, turn))
 
 
 class Damping(nn.Module):
@@ -237,10 +245,9 @@ class Damping(nn.Module):
 
     def forward(self, before: Grains, after: Grains, slow: float) -> Float[Tensor, "n 8"]:
         """Shares between 0 and 1, and times between -2 and 2."""
-        lengths = []
-        for old, new in ((before.vel, after.vel), (before.spin, after.spin)):
-            lengths += [(x.square().sum(1) + SOFT * slow).sqrt() for x in (old, new, new - old)]
-        shares = self.shares(torch.cat([after.latent, fine(torch.cat(lengths, dim=1), slow)], dim=1))
+        moved = torch.stack([before.motion, after.motion, after.motion - before.motion], dim=2)
+        lengths = (moved.square().sum(3) + SOFT * slow).sqrt().flatten(1)
+        shares = self.shares(torch.cat([after.latent, fine(lengths, slow)], dim=1))
         return torch.cat([shares[:, : self.FELT.start].sigmoid(), 2 * shares[:, self.FELT].tanh()], dim=1)
 
 
@@ -254,39 +261,42 @@ def pieces(contacts: Contacts, hidden: int, n: int, *, mutual: bool) -> list[Pie
     for ends, *values in zip(*parts, strict=True):
         grain, order = ends.t().flatten().sort(stable=True)
         side, contact = order // max(1, len(ends)), order % max(1, len(ends))
-        ends, scalars, basis, wall_vel, drift, share = (
+        *values, share = values
+        ends, scalars, basis, wall_vel, drift = (
             None if rows is None else recurring(rows, ROWS, hidden) for rows in (ends, *values)
         )
+        sign = (1 - 2 * side).to(scalars.dtype)
+        if share is not None:
+            share = share[contact, 1 - side]
+            sign = sign * share
         found.append(
             Piece(
-                ends=ends,
-                stacked=ends + n * torch.arange(ends.shape[1], device=ends.device),
+                ends=ends.flatten(),
+                stacked=(ends + n * torch.arange(ends.shape[1], device=ends.device)).flatten(),
+                begins=ends.shape[1] * torch.arange(len(ends), device=ends.device),
                 scalars=scalars,
                 basis=basis.permute(1, 2, 0).contiguous(),
                 slow=contacts.slow,
                 wall_vel=None if wall_vel is None else wall_vel.t()[:, None],
                 drift=None if drift is None else drift.t(),
-                share=None if share is None else share.flip(1).t().flatten(),
-                contact=contact,
-                side=contact + side * len(ends),
+                told=contact,
                 first=torch.searchsorted(grain, torch.arange(n, device=grain.device)),
+                share=share,
+                sign=sign,
             )
         )
     return found
-
-
-def gathered(table: Float[Tensor, "m f"], rows: Int[Tensor, "e sides"]) -> Float[Tensor, "e f"]:
-    """The sum of every contact's rows of a table."""
-    if not torch.is_grad_enabled():
-        return embedding_bag(rows, table, mode="sum")
-    first, *others = (table.index_select(0, side) for side in rows.unbind(1))
-    return sum(others, first)
 
 
 def cross(a: Float[Tensor, "3 channels e"], b: Float[Tensor, "3 1 e"]) -> Float[Tensor, "3 channels e"]:
     """a x b; torch.linalg.cross takes several times as long on a CPU."""
     (x, y, z), (u, v, w) = a, b
     return torch.stack([y * w - z * v, z * u - x * w, x * v - y * u])
+
+
+def dot(a: Float[Tensor, "3 *d e"], b: Float[Tensor, "3 *k e"]) -> Float[Tensor, "*m e"]:
+    """Scalar products of components that lie apart."""
+    return torch.addcmul(torch.addcmul(a[0] * b[0], a[1], b[1]), a[2], b[2])
 
 
 def exchange(grains: Grains, kinds: Sequence[tuple[ImpulseNetwork, Contacts]]) -> Grains:

@@ -158,7 +158,7 @@ def only(chosen: Tensor, function: Callable[[Tensor], Tensor], rows: Tensor, wid
     if rows.device.type != "cpu":
         return torch.where(chosen[:, None], function(rows), 0.0)
     named = chosen.nonzero().flatten()
-    done = function(recurring(rows.index_select(0, named), ROWS, width))[: len(named)]
+    done = function(rows.index_select(0, recurring(named, ROWS, width)))[: len(named)]
     return done.new_zeros(len(rows), done.shape[1]).index_copy(0, named, done)
 
 

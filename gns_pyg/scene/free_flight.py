@@ -45,8 +45,8 @@ def free_flight(
 
 
 def cundall(
-    vel: Float[Tensor, "n 3"], gained: Float[Tensor, "n 3"], damping: Float[Tensor, "n 1"]
-) -> Float[Tensor, "n 3"]:
+    vel: Float[Tensor, "*k n 3"], gained: Float[Tensor, "*k n 3"], damping: Float[Tensor, "n 1"]
+) -> Float[Tensor, "*k n 3"]:
     """What Cundall's damping adds to velocities that one steady force takes from `vel` to `vel` + `gained`: a component
     gains less where the force speeds it up, and loses more where the force slows it down (see `free_flight`).
 
