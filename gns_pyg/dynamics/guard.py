@@ -171,7 +171,7 @@ class PartGuard(nn.Module):
         self, start: Float[Tensor, "n 3"], end: Float[Tensor, "n 3"]
     ) -> tuple[Int[Tensor, " m"], Int[Tensor, " m"], Float[Tensor, " m"]]:
         """Every meeting of a line with a triangle: line, plane, and after which part of the line."""
-        above, way = torch.addmm(-self.offset, start, self.normal.T), torch.linalg.vector_norm(end - start, dim=1)
+        above, way = torch.mm(start, self.normal.T).sub_(self.offset), torch.linalg.vector_norm(end - start, dim=1)
         near = (above >= -self.tolerance_m) & (above <= (way + 2 * self.tolerance_m)[:, None])
         line, plane = near.nonzero().unbind(1)
         above, below = above[line, plane], self._height(end[line], plane)

@@ -199,8 +199,9 @@ class ImpulseRound(MessagePassing):
     ) -> tuple[Tensor, Tensor, Tensor, Tensor]:
         """What every contact knows after this round, says to its grains, and gives the receiver in every channel:
         impulse and turn, (n_contacts, 3 channels)."""
-        basis, (first, _, last) = contacts.basis, self.impulse_mlp
-        rel_vel, spin = self.aggregate(moving, contacts.stacked, contacts.begins).t().contiguous().view(2, 3, self.channels, -1)
+        basis = contacts.basis
+        moved = self.aggregate(moving, contacts.stacked, contacts.begins).t().contiguous()
+        rel_vel, spin = moved.view(2, 3, self.channels, -1)
         if contacts.wall_vel is not None:
             rel_vel = torch.cat([rel_vel[:, :1] + contacts.wall_vel, rel_vel[:, 1:]], dim=1)
         slip = rel_vel - cross(spin, basis[:, :1])  # of the surfaces in touch
@@ -210,9 +211,11 @@ class ImpulseRound(MessagePassing):
         seen = torch.cat([seen, fine(seen, contacts.slow)])
         if self.from_drift is not None and contacts.drift is not None:
             seen, weight = torch.cat([seen, contacts.drift]), torch.cat([weight, self.from_drift.weight], dim=1)
-        known = self.aggregate(latent, contacts.ends, contacts.begins) + dense(edge, self.from_edge.weight, self.from_seen.bias)
+        of_ends = self.aggregate(latent, contacts.ends, contacts.begins)
+        known = of_ends + dense(edge, self.from_edge.weight, self.from_seen.bias)
         message = self.message_mlp(torch.addmm(known, seen.t(), weight.t()).relu_())
         edge = edge + message
+        first, last = (layer for layer in self.impulse_mlp if isinstance(layer, nn.Linear))
         factors = torch.addmm(last.bias[:, None], last.weight, linear(first, edge).relu_().t())
         factors = factors.view(basis.shape[1] + 1, self.channels, len(edge))
         against = factors[-1] / (1 + (speed / FASTEST).square()).sqrt()
@@ -246,41 +249,39 @@ class Damping(nn.Module):
     def forward(self, before: Grains, after: Grains, slow: float) -> Float[Tensor, "n 8"]:
         """Shares between 0 and 1, and times between -2 and 2."""
         moved = torch.stack([before.motion, after.motion, after.motion - before.motion], dim=2)
-        lengths = (moved.square().sum(3) + SOFT * slow).sqrt().flatten(1)
+        x, y, z = moved.square().unbind(3)
+        lengths = (x + y + z + SOFT * slow).sqrt().flatten(1)
         shares = self.shares(torch.cat([after.latent, fine(lengths, slow)], dim=1))
         return torch.cat([shares[:, : self.FELT.start].sigmoid(), 2 * shares[:, self.FELT].tanh()], dim=1)
 
 
 def pieces(contacts: Contacts, hidden: int, n: int, *, mutual: bool) -> list[Piece]:
     """Contacts between `n` grains as pieces that are best handled one after the other."""
-    named = contacts.ends.flip(0)[: 1 + mutual].t()
-    optional = (contacts.wall_vel, contacts.drift, contacts.share)
-    parts = [blocks(rows, hidden) for rows in (named, contacts.scalars, contacts.basis)]
-    parts += [[None] * len(parts[0]) if rows is None else blocks(rows, hidden) for rows in optional]
-    found = []
-    for ends, *values in zip(*parts, strict=True):
-        grain, order = ends.t().flatten().sort(stable=True)
-        side, contact = order // max(1, len(ends)), order % max(1, len(ends))
-        *values, share = values
-        ends, scalars, basis, wall_vel, drift = (
-            None if rows is None else recurring(rows, ROWS, hidden) for rows in (ends, *values)
-        )
-        sign = (1 - 2 * side).to(scalars.dtype)
-        if share is not None:
-            share = share[contact, 1 - side]
+
+    def filled(rows: Tensor, k: int) -> Tensor:
+        return recurring(blocks(rows, hidden)[k], ROWS, hidden)
+
+    found, named = [], contacts.ends.flip(0)[: 1 + mutual].t()
+    for k, these in enumerate(blocks(named, hidden)):
+        grain, order = these.t().flatten().sort(stable=True)
+        side, told = order // max(1, len(these)), order % max(1, len(these))
+        sign, share = (1 - 2 * side).to(contacts.scalars.dtype), None
+        if contacts.share is not None:
+            share = blocks(contacts.share, hidden)[k][told, 1 - side]
             sign = sign * share
+        ends, sides = filled(named, k), torch.arange(1 + mutual, device=named.device)
         found.append(
             Piece(
                 ends=ends.flatten(),
-                stacked=(ends + n * torch.arange(ends.shape[1], device=ends.device)).flatten(),
-                begins=ends.shape[1] * torch.arange(len(ends), device=ends.device),
-                scalars=scalars,
-                basis=basis.permute(1, 2, 0).contiguous(),
+                stacked=(ends + n * sides).flatten(),
+                begins=len(sides) * torch.arange(len(ends), device=named.device),
+                scalars=filled(contacts.scalars, k),
+                basis=filled(contacts.basis, k).permute(1, 2, 0).contiguous(),
                 slow=contacts.slow,
-                wall_vel=None if wall_vel is None else wall_vel.t()[:, None],
-                drift=None if drift is None else drift.t(),
-                told=contact,
-                first=torch.searchsorted(grain, torch.arange(n, device=grain.device)),
+                wall_vel=None if contacts.wall_vel is None else filled(contacts.wall_vel, k).t()[:, None],
+                drift=None if contacts.drift is None else filled(contacts.drift, k).t(),
+                told=told,
+                first=torch.searchsorted(grain, torch.arange(n, device=named.device)),
                 share=share,
                 sign=sign,
             )
