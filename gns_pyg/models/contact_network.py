@@ -99,5 +99,6 @@ class ContactNetwork(nn.Module):
 
 
 def _compact(chosen: Bool[Tensor, " n"], index: Int[Tensor, " e"]) -> tuple[Int[Tensor, " m"], Int[Tensor, " e"]]:
-    """Rows that are chosen, and `index`, which names only those, counted among them."""
-    return chosen.nonzero().flatten(), (chosen.cumsum(0) - 1)[index]
+    """Rows that are chosen, and `index`, which names only those, counted among them (others, which a captured step
+    without enough room may name, as the first: it is done again)."""
+    return chosen.nonzero().flatten(), (chosen.cumsum(0) - 1)[index].clamp(min=0)

@@ -272,15 +272,15 @@ DEFECTS = [
     Defect(
         "a contact's impulse given to both grains alike",
         IMPULSES,
-        "gained + told * sign if side",
-        "gained + told if side",
+        "(1 - 2 * side)",
+        "(1 + 0 * side)",
         ("tests/models/test_impulse_network.py::test_no_momentum_is_made_between_grains",),
     ),
     Defect(
         "the sender of an impulse turned the other way",
         IMPULSES,
-        "gained + told * sign if side",
-        "gained + torch.cat([told[:, :heard], -told[:, heard:]], dim=1) if side",
+        "self.aggregate(turn, *of, piece.share)",
+        "self.aggregate(turn, *of, piece.sign)",
         ("tests/models/test_impulse_network.py::test_a_tangential_impulse_turns_both_grains_alike",),
     ),
     Defect(
