@@ -11,13 +11,13 @@ What a DEM's damping does to that acts along x, y and z: turned from axis to axi
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import Any
 
 import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor, nn
 from torch.nn.functional import embedding_bag
 from torch_geometric.nn import MessagePassing
-from torch_geometric.typing import OptTensor
 
 from gns_pyg.models.mlp import ROWS, blocks, dense, linear, mlp, only, recurring
 from gns_pyg.state import SOFT, Contacts, fine, reached
@@ -40,6 +40,52 @@ class Grains:
     motion: Float[Tensor, "n 2 3 channels"]
 
 
+Rows = tuple[Tensor, Tensor, Tensor | None]  # which rows are summed, where each sum's begin, each row's weight
+Weight = tuple[Tensor, Tensor]  # of each end of each contact: contact after contact, and grain after grain
+
+
+@dataclass(frozen=True)
+class Incidence:
+    """Which grains are at which contacts. As a matrix it takes what grains carry to the contacts, and transposed what
+    contacts give to the grains; so that either is the other's gradient.
+
+    Attributes:
+        ends: the grains of each contact: receiver, between grains then sender.
+        begins: where each contact's begin.
+        told: the contacts of each grain.
+        first: where each grain's begin.
+    """
+
+    ends: Int[Tensor, " e_sides"]
+    begins: Int[Tensor, " e"]
+    told: Int[Tensor, " m"]
+    first: Int[Tensor, " n"]
+
+    def to_contacts(self, rows: Float[Tensor, "n f"], weight: Weight | None = None) -> Float[Tensor, "e f"]:
+        """The sum of the rows of every contact's grains."""
+        here, there = weight or (None, None)
+        return Summed.apply(rows, (self.ends, self.begins, here), (self.told, self.first, there))
+
+    def to_grains(self, rows: Float[Tensor, "e f"], weight: Weight | None = None) -> Float[Tensor, "n f"]:
+        """The sum of the rows of every grain's contacts, always in the same order."""
+        there, here = weight or (None, None)
+        return Summed.apply(rows, (self.told, self.first, here), (self.ends, self.begins, there))
+
+
+class Summed(torch.autograd.Function):
+    """Sums of rows, whose gradient is of the same kind."""
+
+    @staticmethod
+    def forward(ctx: Any, rows: Tensor, named: Rows, back: Rows) -> Tensor:
+        ctx.turned = back, named
+        index, first, weight = named
+        return embedding_bag(index, rows, first, mode="sum", per_sample_weights=weight)
+
+    @staticmethod
+    def backward(ctx: Any, gradient: Tensor) -> tuple[Tensor, None, None]:
+        return Summed.apply(gradient.contiguous(), *ctx.turned), None, None
+
+
 @dataclass(frozen=True)
 class Piece:
     """Contacts that are handled at once, in a number that comes again (see `models.mlp`). What has directions has the
@@ -47,29 +93,21 @@ class Piece:
 
     Attributes:
         scalars, slow, wall_vel, drift: as of `Contacts`.
-        ends: their grains, contact after contact: receiver, between grains then sender.
-        stacked: the same where what receivers show is followed by what senders do.
-        begins: where each contact's begin.
         basis: the contacts' directions; first the normal.
-        told: the contacts of each grain, grain after grain, without what fills up their number.
-        first: where each grain's begin.
-        share: how much more of a change they make than the other side's (see `Contacts`), None where all masses are
-            equal.
-        sign: that of the impulse: -1 for the sender's; times `share`.
+        at: the grains that they are between.
+        differ: of a receiver -1, of a sender 1.
+        pushed, turned: how much of an impulse, and of what it turns, each grain gets (see `Contacts.share`).
     """
 
-    ends: Int[Tensor, " e_sides"]
-    stacked: Int[Tensor, " e_sides"]
-    begins: Int[Tensor, " e"]
     scalars: Float[Tensor, "e f"]
     basis: Float[Tensor, "3 b e"]
     slow: float
     wall_vel: Float[Tensor, "3 1 e"] | None
     drift: Float[Tensor, "d e"] | None
-    told: Int[Tensor, " m"]
-    first: Int[Tensor, " n"]
-    share: Float[Tensor, " m"] | None
-    sign: Float[Tensor, " m"]
+    at: Incidence
+    differ: Weight
+    pushed: Weight
+    turned: Weight
 
 
 class ImpulseNetwork(nn.Module):
@@ -163,56 +201,46 @@ class ImpulseRound(MessagePassing):
     def forward(
         self, grains: Grains, contacts: Sequence[Piece], edges: Sequence[Tensor], hears: Bool[Tensor, " n"]
     ) -> tuple[Grains, list[Tensor]]:
-        motion, heard, after = grains.motion.flatten(1), [], []
-        sign = motion.new_ones(motion.shape[1])
-        sign[: 3 * self.channels] = -1  # slip is the sender's velocity less the receiver's, of spins it takes the sum
-        moving, latent = torch.cat([motion * sign, motion]), linear(self.from_ends, grains.latent)
+        motion, heard, after = grains.motion, [], []
+        vel, spin = (part.flatten(1) for part in grains.motion.unbind(1))
+        latent = linear(self.from_ends, grains.latent)
         for piece, before in zip(contacts, edges, strict=True):
-            of = piece.told, piece.first
-            edge, message, impulse, turn = self.edge_update(piece, before, latent, moving)
-            given = (self.aggregate(impulse, *of, piece.sign), self.aggregate(turn, *of, piece.share))
-            motion = motion + torch.cat(given, dim=1)
+            edge, message, impulse, turn = self.edge_update(piece, before, latent, vel, spin)
+            given = (self.aggregate(impulse, piece.at, piece.pushed), self.aggregate(turn, piece.at, piece.turned))
+            motion = motion + torch.stack(given, dim=1).view(motion.shape)
             if self.update_mlp is not None:
-                heard.append(self.aggregate(message.to(motion.dtype), *of))
+                heard.append(self.aggregate(message.to(motion.dtype), piece.at))
             after.append(edge)
         there = grains.latent
         if self.update_mlp is not None:  # of those that hear: a network that reaches nobody changes nothing
             told = torch.cat([there, sum(heard[1:], heard[0])], dim=1)
             there = there + only(hears, self.update_mlp, told, self.hidden)
-        return Grains(there, motion.view(grains.motion.shape)), after
+        return Grains(there, motion), after
 
-    def aggregate(  # type: ignore[override]
-        self, inputs: Tensor, index: Tensor, ptr: Tensor, weight: OptTensor = None
-    ) -> Tensor:
-        """The sums of rows that go together, (len(ptr), f), in full precision and always in the same order.
-
-        Args:
-            inputs: (n_rows, f).
-            index: rows in the order in which they go together.
-            ptr: where in it each sum's begin.
-            weight: of each.
-        """
-        return embedding_bag(index, inputs, ptr, mode="sum", per_sample_weights=weight)
+    def aggregate(self, inputs: Tensor, at: Incidence, weight: Any = None) -> Tensor:  # type: ignore[override]
+        """What every grain gets from its contacts, in full precision."""
+        return at.to_grains(inputs, weight)
 
     def edge_update(
-        self, contacts: Piece, edge: Tensor, latent: Tensor, moving: Tensor
+        self, contacts: Piece, edge: Tensor, latent: Tensor, vel: Tensor, spin: Tensor
     ) -> tuple[Tensor, Tensor, Tensor, Tensor]:
         """What every contact knows after this round, says to its grains, and gives the receiver in every channel:
         impulse and turn, (n_contacts, 3 channels)."""
-        basis = contacts.basis
-        moved = self.aggregate(moving, contacts.stacked, contacts.begins).t().contiguous()
-        rel_vel, spin = moved.view(2, 3, self.channels, -1)
+        basis, at = contacts.basis, contacts.at
+        rel_vel, turning = (
+            at.to_contacts(rows, weight).t().contiguous().view(3, self.channels, -1)
+            for rows, weight in ((vel, contacts.differ), (spin, None))
+        )
         if contacts.wall_vel is not None:
             rel_vel = torch.cat([rel_vel[:, :1] + contacts.wall_vel, rel_vel[:, 1:]], dim=1)
-        slip = rel_vel - cross(spin, basis[:, :1])  # of the surfaces in touch
+        slip = rel_vel - cross(turning, basis[:, :1])  # of the surfaces in touch
         along = dot(basis[:, :, None], slip[:, None]).flatten(0, 1)
         speed = (dot(slip, slip) + SOFT).sqrt()
         seen, weight = torch.cat([along, speed]), self.from_seen.weight
         seen = torch.cat([seen, fine(seen, contacts.slow)])
         if self.from_drift is not None and contacts.drift is not None:
             seen, weight = torch.cat([seen, contacts.drift]), torch.cat([weight, self.from_drift.weight], dim=1)
-        of_ends = self.aggregate(latent, contacts.ends, contacts.begins)
-        known = of_ends + dense(edge, self.from_edge.weight, self.from_seen.bias)
+        known = at.to_contacts(latent) + dense(edge, self.from_edge.weight, self.from_seen.bias)
         message = self.message_mlp(torch.addmm(known, seen.t(), weight.t()).relu_())
         edge = edge + message
         first, last = (layer for layer in self.impulse_mlp if isinstance(layer, nn.Linear))
@@ -263,27 +291,27 @@ def pieces(contacts: Contacts, hidden: int, n: int, *, mutual: bool) -> list[Pie
 
     found, named = [], contacts.ends.flip(0)[: 1 + mutual].t()
     for k, these in enumerate(blocks(named, hidden)):
-        grain, order = these.t().flatten().sort(stable=True)
-        side, told = order // max(1, len(these)), order % max(1, len(these))
-        sign, share = (1 - 2 * side).to(contacts.scalars.dtype), None
-        if contacts.share is not None:
-            share = blocks(contacts.share, hidden)[k][told, 1 - side]
-            sign = sign * share
         ends, sides = filled(named, k), torch.arange(1 + mutual, device=named.device)
+        grain, order = these.flatten().sort(stable=True)
+        first = torch.searchsorted(grain, torch.arange(n, device=named.device))
+        begins = len(sides) * torch.arange(len(ends), device=named.device)
+        differ = (2 * sides - 1).to(contacts.scalars.dtype).expand(ends.shape)
+        pushed, turned = -differ, torch.ones_like(differ)
+        if contacts.share is not None:
+            turned = filled(contacts.share, k).flip(1)
+            pushed = pushed * turned
+        weights = [(each.flatten(), each.flatten()[order]) for each in (differ, pushed, turned)]
         found.append(
             Piece(
-                ends=ends.flatten(),
-                stacked=(ends + n * sides).flatten(),
-                begins=len(sides) * torch.arange(len(ends), device=named.device),
                 scalars=filled(contacts.scalars, k),
                 basis=filled(contacts.basis, k).permute(1, 2, 0).contiguous(),
                 slow=contacts.slow,
                 wall_vel=None if contacts.wall_vel is None else filled(contacts.wall_vel, k).t()[:, None],
                 drift=None if contacts.drift is None else filled(contacts.drift, k).t(),
-                told=told,
-                first=torch.searchsorted(grain, torch.arange(n, device=named.device)),
-                share=share,
-                sign=sign,
+                at=Incidence(ends.flatten(), begins, order // len(sides), first),
+                differ=weights[0],
+                pushed=weights[1],
+                turned=weights[2],
             )
         )
     return found

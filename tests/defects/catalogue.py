@@ -272,15 +272,15 @@ DEFECTS = [
     Defect(
         "a contact's impulse given to both grains alike",
         IMPULSES,
-        "(1 - 2 * side)",
-        "(1 + 0 * side)",
+        "pushed, turned = -differ,",
+        "pushed, turned = torch.ones_like(differ),",
         ("tests/models/test_impulse_network.py::test_no_momentum_is_made_between_grains",),
     ),
     Defect(
         "the sender of an impulse turned the other way",
         IMPULSES,
-        "self.aggregate(turn, *of, piece.share)",
-        "self.aggregate(turn, *of, piece.sign)",
+        "self.aggregate(turn, piece.at, piece.turned)",
+        "self.aggregate(turn, piece.at, piece.pushed)",
         ("tests/models/test_impulse_network.py::test_a_tangential_impulse_turns_both_grains_alike",),
     ),
     Defect(

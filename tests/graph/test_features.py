@@ -4,7 +4,7 @@ import pytest
 import torch
 
 from gns_pyg.graph.features import grain_edges, wall_edges
-from gns_pyg.state import Graph, State, Walls
+from gns_pyg.state import Graph, State, Walls, fine
 
 R = 0.01
 OPTIONS = dict(velocity_m_s=0.5, dt_s=0.01, contact=True, dtype=torch.float64)
@@ -98,3 +98,18 @@ def test_a_gap_of_a_micrometre_is_exact_in_float32(gap_m):
     walls = Walls(tensor([0.3 * R, 0.0, -R - gap_m]), up, 0 * up, tensor(0.5))
     edge = Graph(torch.empty(2, 0, dtype=torch.long), torch.tensor([[0], [0]]), walls)
     assert split(wall_edges(state, edge, walls, **in_float32))[4][0] == pytest.approx(gap_m / R, rel=1e-6)
+
+
+@pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
+def test_the_fine_scale_is_an_inverse_hyperbolic_sine(dtype) -> None:
+    sizes = torch.cat([torch.zeros(1), torch.logspace(-30, 15, 91)]).to(dtype)
+    values = torch.cat([-sizes.flip(0), sizes])
+    assert torch.allclose(fine(values, 0.5), torch.asinh(2 * values) / 4, rtol=4 * torch.finfo(dtype).eps, atol=0)
+    assert fine(torch.tensor([3e38]), 1.0).isfinite().all()
+    assert fine(torch.tensor([torch.nan]), 1.0).isnan().all()
+
+
+def test_the_fine_scale_can_be_differentiated_twice_at_nothing_too() -> None:
+    values = torch.tensor([-3.0, -1e-3, 0.0, 1e-3, 2.0], dtype=torch.float64, requires_grad=True)
+    for check in (torch.autograd.gradcheck, torch.autograd.gradgradcheck):
+        assert check(lambda x: fine(x, 0.5), values)

@@ -7,8 +7,9 @@ import torch
 from scipy.spatial.transform import Rotation
 
 from gns_pyg.errors import ConfigError
+from gns_pyg.models.impulse_network import pieces
 from gns_pyg.scene.free_flight import cundall
-from gns_pyg.state import Walls
+from gns_pyg.state import Contacts, Walls
 from tests import scenes
 from tests.simulators import IMPULSE, simulator, state_in_box
 
@@ -88,6 +89,30 @@ def test_pieces_give_what_the_whole_gives(monkeypatch):
     monkeypatch.setattr("gns_pyg.models.mlp.BLOCK", 16 * 7 // torch.get_num_threads())
     with torch.no_grad():
         assert torch.allclose(network.correction(start), whole, atol=1e-12)
+
+
+@pytest.mark.parametrize("mutual", [True, False])
+def test_what_contacts_see_and_give_are_each_others_gradient(mutual):
+    """Against plain sums, filled up contacts and unlike masses too; twice differentiable."""
+    random, n, e = torch.Generator().manual_seed(0), 6, 11
+    ends, share = torch.randint(n, (2, e), generator=random), torch.rand(e, 2, generator=random).double()
+    share = share if mutual else torch.ones_like(share)
+    bare = Contacts(
+        ends, torch.zeros(e, 1).double(), torch.zeros(e, 3, 2).double(), 0.1, share=share if mutual else None
+    )
+    (piece,) = pieces(bare, 16, n, mutual=mutual)
+    grains, given = (torch.randn(m, 3, generator=random).double().requires_grad_() for m in (n, len(piece.at.begins)))
+    sender, receiver = ends
+    with torch.no_grad():
+        seen = grains[sender] - grains[receiver] if mutual else -grains[receiver]
+        assert torch.allclose(piece.at.to_contacts(grains, piece.differ)[:e], seen)
+        got = torch.zeros_like(grains).index_add(0, receiver, share[:, 1:] * given[:e])
+        if mutual:
+            got = got.index_add(0, sender, -share[:, :1] * given[:e])
+        assert torch.allclose(piece.at.to_grains(given, piece.pushed), got)
+    for check in (torch.autograd.gradcheck, torch.autograd.gradgradcheck):
+        check(lambda x: piece.at.to_contacts(x, piece.differ)[:e], grains)
+        check(lambda x: piece.at.to_grains(x, piece.pushed), given)
 
 
 def test_every_pair_is_there_once():
