@@ -138,7 +138,7 @@ class ImpulseNetwork(nn.Module):
         self.hidden, self.mutual = hidden, mutual
         self.encode = mlp(n_scalar, hidden, hidden, mlp_layers, layer_norm=True)
         self.rounds = nn.ModuleList(
-            ImpulseRound(hidden, mlp_layers, channels, n_basis, mutual=mutual, last=turn == layers - 1, memory=memory)
+            ImpulseRound(hidden, mlp_layers, channels, n_basis, last=turn == layers - 1, memory=memory)
             for turn in range(layers)
         )
 
@@ -172,15 +172,13 @@ class ImpulseRound(MessagePassing):
     """One round: every contact exchanges messages and impulses, then the grains' latents follow.
 
     Args:
-        hidden, mlp_layers, channels, n_basis, mutual, memory: see `ImpulseNetwork`.
+        hidden, mlp_layers, channels, n_basis, memory: see `ImpulseNetwork`.
         last: no later round would read the grains' latents.
     """
 
-    def __init__(
-        self, hidden: int, mlp_layers: int, channels: int, n_basis: int, *, mutual: bool, last: bool, memory: bool
-    ) -> None:
+    def __init__(self, hidden: int, mlp_layers: int, channels: int, n_basis: int, *, last: bool, memory: bool) -> None:
         super().__init__(aggr="sum", flow="source_to_target")
-        self.hidden, self.channels, self.mutual = hidden, channels, mutual
+        self.hidden, self.channels = hidden, channels
         n_given = channels * (n_basis + 1)
         self.from_seen = nn.Linear(2 * n_given, hidden)
         self.from_ends = nn.Linear(hidden, hidden, bias=False)  # a pair looks the same from either side
