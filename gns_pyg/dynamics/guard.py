@@ -175,8 +175,8 @@ class PartGuard(nn.Module):
         near = (above >= -self.tolerance_m) & (above <= (way + 2 * self.tolerance_m)[:, None])
         line, plane = near.nonzero().unbind(1)
         above, below = above[line, plane], self._height(end[line], plane)
-        meets = (below < self.tolerance_m) & (below < above)
-        line, plane, height, depth = line[meets], plane[meets], above[meets].clamp(min=0), below[meets]
+        passes = (below < self.tolerance_m) & (below < above)
+        line, plane, height, depth = line[passes], plane[passes], above[passes].clamp(min=0), below[passes]
         part_of_way = (height / (height - depth).clamp(min=self.tolerance_m)).clamp(max=1)
         meets = start[line] + part_of_way[:, None] * (end[line] - start[line])
         n_triangles = self.first[plane + 1] - self.first[plane]
