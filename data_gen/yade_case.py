@@ -117,10 +117,11 @@ class Grains:
 
     def frame(self, time_s: float, dt_s: float) -> None:
         """Reads all grains, then lets those out that are beyond the outlet and those in whose time has come."""
-        # Yade hands out live references: without np.array every frame would hold the last one's values.
-        for grain, body in self.bodies.items():
-            self.pos[grain], self.vel[grain] = np.array(body.state.pos), np.array(body.state.vel)
-            self.ang_vel[grain] = np.array(body.state.angVel)
+        there, states = list(self.bodies), [body.state for body in self.bodies.values()]
+        for array, name in ((self.pos, "pos"), (self.vel, "vel"), (self.ang_vel, "angVel")):
+            vectors = (getattr(state, name) for state in states)
+            components = [(vector[0], vector[1], vector[2]) for vector in vectors]  # not np.array: ten times as long
+            array[there] = np.array(components).reshape(-1, 3)
         if (outlet := self.scene["outlet"]) is not None:
             beyond = (self.pos - outlet["point_m"]) @ np.array(outlet["normal"]) > 0
             for grain in np.flatnonzero(beyond & self.active).tolist():
