@@ -78,7 +78,7 @@ def test_fast_grains_go_as_without_a_memory_and_slow_ones_do_not() -> None:
     plain.load_state_dict({k: v for k, v in network.state_dict().items() if ".from_drift." not in k})
     state = slow_state()
     fast = replace(state, drift=10 * state.vel)
-    torch.testing.assert_close(network.correction(fast), plain.correction(fast), rtol=0, atol=1e-13)  # sums of zeros too
+    torch.testing.assert_close(network.correction(fast), plain.correction(fast), rtol=0, atol=1e-13)
     assert (network.correction(state) - plain.correction(state)).abs().max() > 1e-3
     assert network(state).drift is not None
     assert plain(replace(state, drift=None)).drift is None
